@@ -1,0 +1,1 @@
+"""Protocols, files and networks at the edge of fusiond; installed as the import package `fusiond_adapters`."""

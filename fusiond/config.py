@@ -1,0 +1,329 @@
+"""The configuration: TOML to typed, frozen structs; an error names the file, the line, the key and what is allowed."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta, Struct, field
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="letters, digits, underscore")]
+Vector = tuple[float, float, float]
+Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
+Encoding = Literal["json", "msgpack"]
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; the message says where and why."""
+
+
+class Section(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A TOML table: unknown keys are errors."""
+
+
+class Vehicle(Section, frozen=True, kw_only=True):
+    """[vehicle]"""
+
+    name: Name = "vehicle"  # names the vehicle in every published key
+
+
+class Filter(Section, frozen=True, kw_only=True):
+    """[filter]: the estimator, its memory and how it starts."""
+
+    horizon_s: Positive = 1.0  # how late a measurement may be and still be put where it belongs
+    snapshot_interval_s: NotNegative = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
+    imu_gap_s: Positive = 0.2  # an IMU silent for longer is bridged by coasting at constant velocity
+    restart_gap_s: Positive = 30.0  # after a hole in the data of this length the filter aligns anew
+    gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
+    gnss_reset_s: Positive = 10.0  # GNSS rejected for this long without a break is believed again
+    v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
+    heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # given start heading, clockwise from north
+    heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
+    course_speed_mps: Positive = 3.0  # above this GNSS speed its course gives the start heading
+    level_sigma_deg: Positive = 3.0  # sigma of roll and pitch after leveling on the accelerometer
+    position_timeout_s: Positive = 2.0  # without a position fix for this long: dead reckoning
+    lost_sigma_m: Positive = 200.0  # horizontal position sigma beyond which the state is called lost
+    wheel_scale_sigma: NotNegative = 0.01  # first sigma of the common wheel scale (1 = 100 %); 0 freezes it at zero
+    wheel_scale_walk: NotNegative = 1e-5  # its random walk [1/sqrt(s)]
+    mount_sigma_deg: NotNegative = 1.0  # first sigma of the IMU's pitch and yaw against the vehicle; 0 freezes them
+    mount_walk_deg: NotNegative = 1e-3  # its random walk [deg/sqrt(s)]
+
+
+class Motion(Section, frozen=True, kw_only=True):
+    """[motion]: what a wheeled vehicle cannot do, used as measurements."""
+
+    non_holonomic: bool = True  # no sideways or vertical speed at the point below
+    point_m: Vector = (0.0, 0.0, 0.0)  # where it holds, from the IMU: the middle of the unsteered axle
+    lateral_sigma_mps: Positive = 0.2
+    vertical_sigma_mps: Positive = 0.3
+    interval_s: Positive = 0.1  # spacing of constraint, zero velocity and zero rotation updates
+    minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint rests below this speed
+    standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
+    still_wheel_mps: Positive = 0.1  # every wheel at or below this
+    still_gyro_deg_s: Positive = 0.6  # and the gyro's scatter below this
+    still_accel_mps2: Positive = 0.25  # and the accelerometer's scatter below this
+    still_after_s: Positive = 0.5  # for this long
+    zero_velocity_sigma_mps: Positive = 0.02
+    zero_rotation_sigma_deg_s: Positive = 0.1
+
+
+class Mavlink(Section, frozen=True, kw_only=True):
+    """[mavlink.NAME]: one MAVLink link; a .tlog given to replay stands for the first of them."""
+
+    connection: str = "udpin:127.0.0.1:14550"  # pymavlink connection string
+    baud: Annotated[int, Meta(gt=0)] = 115200  # for serial devices
+    dialect: Name = "common"  # pymavlink dialect, "common" or "ardupilotmega"
+    system: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this system id; 0: the first autopilot heard
+    component: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this component id; 0: every one
+
+
+class Can(Section, frozen=True, kw_only=True):
+    """[can.NAME]: one CAN bus."""
+
+    dbc: list[str] = field(default_factory=list)  # DBC files, relative to this file
+    log_channel: str | None = None  # the bus's name in a log; default: NAME
+    interface: str | None = None  # python-can interface; default: python-can's own configuration
+    channel: str | None = None  # python-can channel; default: python-can's own configuration
+    config_context: str | None = None  # section of python-can's own configuration file
+    fd: bool = False  # CAN FD
+    delay_ms: NotNegative = 0.0  # how old a frame is when it is received
+
+
+class Imu(Section, frozen=True, kw_only=True):
+    """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"] = "HIGHRES_IMU"
+    instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
+    rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
+    delay_ms: float = 0.0  # how long before its stamp the sample was true
+    accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
+    gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
+    accel_bias_sigma: NotNegative = 0.3  # first sigma of the accelerometer bias [m/s^2]
+    gyro_bias_sigma: NotNegative = 0.01  # first sigma of the gyro bias [rad/s]
+    accel_bias_walk: NotNegative = 1e-3  # accelerometer bias random walk [m/s^2/sqrt(s)]
+    gyro_bias_walk: NotNegative = 2e-5  # gyro bias random walk [rad/s/sqrt(s)]
+    accel_limit: Positive = 160.0  # a sample beyond this is invalid [m/s^2]
+    gyro_limit: Positive = 35.0  # a sample beyond this is invalid [rad/s]
+
+
+class Gnss(Section, frozen=True, kw_only=True):
+    """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
+    delay_ms: float = 0.0  # how long before its stamp the position was true
+    velocity_delay_ms: float = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
+    stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's own stamp, use the receipt less delay_ms
+    position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and the least it is believed to be
+    height_sigma_m: Positive = 3.0  # likewise, vertical
+    velocity_sigma_mps: Positive = 0.2  # likewise, per axis
+    position_correlation_s: NotNegative = 0.0  # time over which position errors stay alike: weighs dense fixes down
+    velocity_correlation_s: NotNegative = 0.0  # likewise, velocity
+    use_velocity: bool = True
+    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3
+    interval_s: Positive = 0.2  # expected spacing of fixes
+
+
+class Wheel(Section, frozen=True, kw_only=True):
+    """[wheel.NAME]: one wheel; each is a source of its own."""
+
+    bus: Name  # the [can.BUS] it comes by
+    message: str  # message name in the DBC
+    signal: str  # signal name in the DBC
+    unit: Unit = "km/h"  # of the decoded signal; rad/s and rpm need radius_m
+    radius_m: Positive | None = None  # rolling radius
+    scale: float = 1.0  # known factor on the signal; negative where it counts backwards
+    unsigned: bool = True  # the signal tells the amount only, not the direction
+    direction_signal: str | None = None  # a signal whose value reverse_value means driving backwards
+    reverse_value: int = 1
+    valid_signal: str | None = None  # a signal that must equal valid_value
+    valid_value: int = 0
+    counter_signal: str | None = None  # a rolling counter; a repeated value marks a stale frame
+    position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
+    steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
+    sigma_mps: Positive = 0.1  # white noise of one reading
+    quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
+    correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
+    delay_ms: float = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)
+
+
+class Publish(Section, frozen=True, kw_only=True):
+    """[publish]"""
+
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
+    encoding: Encoding = "json"  # "json" or "msgpack"
+
+
+class Zenoh(Section, frozen=True, kw_only=True):
+    """[zenoh]: where the state is published. Loopback and no scouting unless said otherwise."""
+
+    mode: Literal["peer", "client", "router"] = "peer"
+    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:0"])
+    connect: list[str] = field(default_factory=list)
+    multicast_scouting: bool = False
+    config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
+
+
+class Config(Section, frozen=True, kw_only=True):
+    """The whole file."""
+
+    vehicle: Vehicle = field(default_factory=Vehicle)
+    filter: Filter = field(default_factory=Filter)
+    motion: Motion = field(default_factory=Motion)
+    publish: Publish = field(default_factory=Publish)
+    zenoh: Zenoh = field(default_factory=Zenoh)
+    mavlink: dict[Name, Mavlink] = field(default_factory=dict)
+    can: dict[Name, Can] = field(default_factory=dict)
+    imu: dict[Name, Imu] = field(default_factory=dict)
+    gnss: dict[Name, Gnss] = field(default_factory=dict)
+    wheel: dict[Name, Wheel] = field(default_factory=dict)
+    directory: str = "."  # set on loading: where relative file names start
+
+    def path(self, name: str) -> Path:
+        """A file name of the configuration, resolved against its folder."""
+        return Path(self.directory) / name
+
+    def sources(self) -> tuple[str, ...]:
+        """Every source of measurements, in the order that breaks ties of time."""
+        gnss = [f"{name}.{kind}" for name in self.gnss for kind in ("position", "velocity")]
+        return tuple(sorted([*self.imu, *gnss, *self.wheel]))
+
+
+def load(file: str | Path) -> Config:
+    """Read and check a configuration file. Raises ConfigError."""
+    path = Path(file)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text") from error
+    return parse(text, path)
+
+
+def parse(text: str, path: Path = Path("config.toml")) -> Config:
+    """Check the text of a configuration file; `path` serves for messages and relative names. Raises ConfigError."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    if "directory" in table:
+        raise ConfigError(f"{path}: unknown key 'directory'")
+    try:
+        config = msgspec.convert(table | {"directory": str(path.parent)}, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(_explain(str(error), table, text, path)) from error
+    for key, complaint in _contradictions(config):
+        raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
+    return config
+
+
+def _contradictions(config: Config) -> list[tuple[str, str]]:
+    """What the types cannot say: references between tables, and combinations that make no sense."""
+    found: list[tuple[str, str]] = []
+
+    def refer(kind: str, name: str, key: str, target: str, known: dict[str, Mavlink] | dict[str, Can]) -> None:
+        if target not in known:
+            table = "mavlink" if key == "link" else "can"
+            have = ", ".join(sorted(known)) or "none"
+            found.append((f"{kind}.{name}.{key}", f"there is no [{table}.{target}]; configured: {have}"))
+
+    for name, imu in config.imu.items():
+        refer("imu", name, "link", imu.link, config.mavlink)
+    for name, gnss in config.gnss.items():
+        refer("gnss", name, "link", gnss.link, config.mavlink)
+    for name, wheel in config.wheel.items():
+        refer("wheel", name, "bus", wheel.bus, config.can)
+        if wheel.unit in ("rad/s", "rpm") and wheel.radius_m is None:
+            found.append((f"wheel.{name}.unit", f"{wheel.unit} needs radius_m"))
+        if wheel.scale == 0:
+            found.append((f"wheel.{name}.scale", "must not be 0"))
+    for name, can in config.can.items():
+        for dbc in can.dbc:
+            if not config.path(dbc).is_file():
+                found.append((f"can.{name}.dbc", f"no such file: {config.path(dbc)}"))
+        if not can.dbc and any(wheel.bus == name for wheel in config.wheel.values()):
+            found.append((f"can.{name}", "its wheels need a DBC file: dbc = [\"FILE.dbc\"]"))
+    if len(config.imu) != 1:
+        found.append(("imu", f"exactly one [imu.NAME] is needed, found {len(config.imu)}"))
+    names = [*config.imu, *config.gnss, *config.wheel]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        found.append((name, "names two sources; every source needs a name of its own"))
+    if config.filter.imu_gap_s >= config.filter.horizon_s:
+        found.append(("filter.imu_gap_s", f"must be below horizon_s ({config.filter.horizon_s} s)"))
+    return found
+
+
+def _explain(message: str, table: dict[str, object], text: str, path: Path) -> str:
+    """msgspec's complaint, with the file's line, the dotted key and the allowed keys."""
+    where = re.search(r" - at `(?:key in )?\$\.?(.*?)`$", message)
+    inside = where.group(1) if where else ""
+    what = message[: where.start()] if where else message
+    key = _resolve(inside, message, table)
+    unknown = re.search(r"unknown field `(\w+)`", message)
+    if unknown:
+        key = f"{key}.{unknown.group(1)}" if key else unknown.group(1)
+        what = f"unknown key; allowed: {', '.join(_allowed(key))}"
+    missing = re.search(r"missing required field `(\w+)`", message)
+    if missing:
+        what = f"the key '{missing.group(1)}' is missing"
+    return f"{path}:{_line_of(key, text)}: {key or 'the file'}: {what}"
+
+
+def _resolve(inside: str, message: str, table: dict[str, object]) -> str:
+    """msgspec writes `[...]` for a table's name: find the name whose content has the fault."""
+    if "[...]" not in inside:
+        return inside
+    head, tail = inside.split("[...]", 1)
+    entries = table.get(head)
+    kind = _TABLES.get(head)
+    if isinstance(entries, dict) and kind is not None:
+        for name, entry in entries.items():
+            try:
+                msgspec.convert({name: entry}, dict[Name, kind])  # type: ignore[valid-type]
+            except msgspec.ValidationError as error:
+                if str(error) == message.replace(f"$.{head}[...]", "$[...]"):
+                    return f"{head}.{name}{tail}"
+    return head
+
+
+_TABLES: dict[str, type[Section]] = {"mavlink": Mavlink, "can": Can, "imu": Imu, "gnss": Gnss, "wheel": Wheel}
+
+
+def _allowed(key: str) -> list[str]:
+    """The keys that may stand where `key` stands."""
+    parts = key.split(".")
+    if len(parts) == 1:
+        return sorted(set(Config.__struct_fields__) - {"directory"})
+    kind = _TABLES.get(parts[0])
+    if kind is None:
+        default = getattr(Config(), parts[0], None)
+        kind = type(default) if isinstance(default, Section) else None
+    return sorted(kind.__struct_fields__) if kind else []
+
+
+def _line_of(key: str, text: str) -> int:
+    """The line on which a dotted key, or else the nearest table above it, stands; 1 if none does."""
+    parts = key.split(".")
+    table, best, depth = "", 1, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        head = re.match(r"\s*\[+([^\]]+)\]", line)
+        if head:
+            table = head.group(1).strip()
+            shared = len([1 for a, b in zip(table.split("."), parts, strict=False) if a == b])
+            if key.startswith(table) and shared > depth:
+                best, depth = number, shared
+            continue
+        assigned = re.match(r"\s*([\w.\-]+)\s*=", line)
+        if assigned:
+            full = f"{table}.{assigned.group(1)}" if table else assigned.group(1)
+            if full == key or key.startswith(full + "["):
+                return number
+    return best

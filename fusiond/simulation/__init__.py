@@ -1,0 +1,1 @@
+"""A seeded vehicle simulator: trajectory, sensors and their faults, in the true wire formats."""
