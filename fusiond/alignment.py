@@ -1,0 +1,175 @@
+"""How the filter starts: level from gravity, heading from the GNSS course or given, gyro bias from a standstill.
+
+While aligning, the state only gathers: means of the inertial samples (`motion.watch`), the last fix, the velocity at the
+begin of a window. It starts at the first event at which position, level and heading are known. In motion, the vehicle's
+own acceleration, as the change of GNSS velocity tells it, is taken out of the accelerometer before leveling.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusiond.earth import Array, geodetic_trig, mat_ne_from_trig
+from fusiond.motion import MEAN_FILLED, watch
+from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
+from fusiond.observe.model import LEVER_ARM_B
+from fusiond.plan import IMU, MODEL, SECOND, Plan
+from fusiond.rotation import matrix_from_euler, quaternion
+from fusiond.state import (
+    ACCEL_BIAS,
+    ALIGNING,
+    ATTITUDE,
+    FIRST_VELOCITY_N,
+    FIX_E,
+    FIX_VARIANCE,
+    FORCE_B,
+    GYRO_BIAS,
+    GYRO_BIAS_B,
+    HELD_FORCE_B,
+    HELD_RATE_B,
+    LAST_VALUE,
+    MEAN_FORCE_B,
+    MEAN_RATE_B,
+    MEAN_WEIGHT,
+    MOUNT_ERROR,
+    NEVER,
+    PHASE,
+    POSITION,
+    POSITION_E,
+    QUATERNION_EB,
+    RATE_B,
+    REST_RATE_B,
+    RUNNING,
+    SCALE,
+    T_CONSTRAINT,
+    T_FIRST_VELOCITY,
+    T_FIX,
+    T_IMU,
+    T_POSITION,
+    T_REST,
+    T_START,
+    T_STILL,
+    VELOCITY,
+    VELOCITY_E,
+    FilterState,
+    T,
+)
+
+FIX_FRESH_NS = 2 * SECOND  # a fix older than this does not start the filter
+WINDOW_LEAST_NS = SECOND  # the GNSS velocities that tell the vehicle's acceleration lie at least so far apart
+WINDOW_MOST_NS = 3 * SECOND  # and at most so far
+REST_FRESH_NS = 600 * SECOND  # a standstill longer ago tells nothing of the gyro bias
+REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
+COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a careless mount
+
+
+def begin(state: FilterState) -> None:
+    """Forget everything but the biases and calibrations, and start to align."""
+    state.stamps[[T, T_IMU, T_CONSTRAINT, T_STILL, T_FIRST_VELOCITY, T_FIX, T_REST, T_START, T_POSITION]] = NEVER
+    state.stamps[PHASE] = ALIGNING
+    state.auxiliary[:] = 0.0
+    state.source_stamps[:] = NEVER
+
+
+def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan) -> None:
+    """Take in one event while aligning, and start the filter if it completes what is needed."""
+    stamps, auxiliary = state.stamps, state.auxiliary
+    model = plan.models[source]
+    stamps[T] = t_ns
+    if model == IMU:
+        force_b, rate_b = values[0:3], values[3:6]
+        if stamps[T_IMU] != NEVER:
+            watch(state, force_b, rate_b, (t_ns - stamps[T_IMU]) * 1e-9, plan)
+        stamps[T_IMU] = t_ns
+        auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = force_b
+        auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = rate_b
+        if stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= plan.still_after_ns:
+            auxiliary[REST_RATE_B] = auxiliary[MEAN_RATE_B]
+            stamps[T_REST] = t_ns
+    elif model == MODEL["wheel_speed"]:
+        state.memory[source, LAST_VALUE] = values[wheel_speed.SPEED]
+    elif model == MODEL["gnss_position"]:
+        auxiliary[FIX_E] = values[gnss_position.PLACE_E]
+        auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
+        stamps[T_FIX] = t_ns
+        if plan.filter.heading_deg is not None and _leveled(state):
+            variance = (plan.filter.v_max_mps / 3) ** 2
+            if stamps[T_STILL] != NEVER:
+                variance = plan.motion.zero_velocity_sigma_mps**2
+            heading, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
+            _start(state, source, np.zeros(3), variance, (heading, sigma), plan)
+    elif model == MODEL["gnss_velocity"]:
+        _gather_velocity(state, source, values, plan)
+
+
+def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan) -> None:
+    stamps, auxiliary = state.stamps, state.auxiliary
+    velocity_n = values[gnss_velocity.VELOCITY_N]
+    window = stamps[T] - stamps[T_FIRST_VELOCITY]
+    if stamps[T_FIRST_VELOCITY] == NEVER or window > WINDOW_MOST_NS:
+        auxiliary[FIRST_VELOCITY_N] = velocity_n
+        stamps[T_FIRST_VELOCITY] = stamps[T]
+        return
+    speed = math.hypot(velocity_n[0], velocity_n[1])
+    fresh = stamps[T_FIX] != NEVER and stamps[T] - stamps[T_FIX] <= FIX_FRESH_NS
+    if window < WINDOW_LEAST_NS or speed < plan.filter.course_speed_mps or not fresh or not _leveled(state):
+        return
+    course = math.atan2(velocity_n[1], velocity_n[0])
+    variance = values[gnss_velocity.VARIANCE]
+    sigma = math.hypot(math.sqrt(variance) / speed, COURSE_SIGMA)
+    if plan.filter.heading_deg is not None:
+        course, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
+    _start(state, source, velocity_n, variance, (course, sigma), plan)
+
+
+def _leveled(state: FilterState) -> bool:
+    return bool(state.auxiliary[MEAN_WEIGHT] >= MEAN_FILLED)
+
+
+def _start(
+    state: FilterState, source: int, velocity_n: Array, variance: float, heading: tuple[float, float], plan: Plan
+) -> None:
+    """Make the first state from what was gathered: velocity (3,) [m/s] with its variance, heading and sigma [rad]."""
+    stamps, auxiliary, x = state.stamps, state.auxiliary, state.nominal
+    yaw, yaw_sigma = heading
+    to_n = mat_ne_from_trig(*geodetic_trig(*(float(c) for c in auxiliary[FIX_E])))
+    mat_nb = matrix_from_euler(*_level(state, velocity_n, yaw), yaw)
+    since = (stamps[T] - stamps[T_FIX]) * 1e-9
+    lever_b = plan.parameters[source][LEVER_ARM_B]
+    x[POSITION_E] = auxiliary[FIX_E] + to_n.T @ (velocity_n * since - mat_nb @ lever_b)
+    x[VELOCITY_E] = to_n.T @ velocity_n
+    x[QUATERNION_EB] = quaternion(to_n.T @ mat_nb)
+    rest = stamps[T_REST] != NEVER and stamps[T] - stamps[T_REST] <= REST_FRESH_NS
+    if rest:
+        x[GYRO_BIAS_B] = auxiliary[REST_RATE_B]
+    horizontal, vertical = auxiliary[FIX_VARIANCE]
+    level = math.radians(plan.filter.level_sigma_deg) ** 2
+    covariance = state.covariance
+    covariance[:] = 0.0
+    aged = variance * since * since
+    covariance[POSITION, POSITION] = to_n.T @ np.diag([horizontal + aged, horizontal + aged, vertical + aged]) @ to_n
+    covariance[VELOCITY, VELOCITY] = np.eye(3) * variance
+    covariance[ATTITUDE, ATTITUDE] = to_n.T @ np.diag([level, level, yaw_sigma**2]) @ to_n
+    for block, sigma in (
+        (GYRO_BIAS, min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma),
+        (ACCEL_BIAS, plan.imu.accel_bias_sigma),
+        (SCALE, plan.filter.wheel_scale_sigma),
+        (MOUNT_ERROR, math.radians(plan.filter.mount_sigma_deg)),
+    ):
+        for i in range(block.start, block.stop):
+            covariance[i, i] = sigma**2
+    stamps[[T_START, T_CONSTRAINT, T_POSITION]] = stamps[T]
+    stamps[PHASE] = RUNNING
+
+
+def _level(state: FilterState, velocity_n: Array, yaw: float) -> tuple[float, float]:
+    """Roll and pitch [rad] at which the mean specific force is gravity's reaction and the vehicle's own acceleration."""
+    force = state.auxiliary[MEAN_FORCE_B].copy()
+    window = (state.stamps[T] - state.stamps[T_FIRST_VELOCITY]) * 1e-9
+    if state.stamps[T_STILL] == NEVER and state.stamps[T_FIRST_VELOCITY] != NEVER and window > 0:
+        north, east, _ = (velocity_n - state.auxiliary[FIRST_VELOCITY_N]) / window
+        force[0] -= math.cos(yaw) * north + math.sin(yaw) * east
+        force[1] -= math.cos(yaw) * east - math.sin(yaw) * north
+    return math.atan2(-force[1], -force[2]), math.atan2(force[0], math.hypot(force[1], force[2]))

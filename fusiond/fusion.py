@@ -1,0 +1,199 @@
+"""Fusion: events in, outcomes and estimates out. The one door to the core; live and replay differ only in who calls it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+
+from fusiond.clock import Clock
+from fusiond.config import Config, Imu
+from fusiond.earth import Array, geodetic, mat_ne
+from fusiond.estimate import Estimate, Mode, StateEstimate
+from fusiond.history import History
+from fusiond.kernel import Outcome, predict
+from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Received, WheelSpeed
+from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
+from fusiond.plan import SECOND, nanoseconds, plan
+from fusiond.rotation import matrix, quaternion
+from fusiond.state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_B,
+    ATTITUDE,
+    FORCE_B,
+    GYRO_BIAS,
+    GYRO_BIAS_B,
+    MOUNT,
+    MOUNT_ERROR,
+    NEVER,
+    PHASE,
+    POSITION_E,
+    QUATERNION_EB,
+    RATE_B,
+    RESETS,
+    RUNNING,
+    SCALE,
+    T_IMU,
+    T_POSITION,
+    VELOCITY_E,
+    WHEEL_SCALE,
+    FilterState,
+    T,
+)
+
+LOST_IMU_NS = 5 * SECOND  # without an inertial sample for so long the state is called lost
+HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
+SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
+
+
+class Receipt(NamedTuple):
+    """What became of an event that was received."""
+
+    measurement: Measurement
+    outcome: Outcome
+    reason: str = ""  # of INVALID
+
+
+class Fusion:
+    """Clock, history and filter of one vehicle, by its configuration."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.plan = plan(config)
+        self.clock = Clock(config)
+        self.history = History(self.plan)
+        self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
+
+    def receive(self, received: Received) -> Receipt | None:
+        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only.
+
+        The source must be one of the configuration's; ValueError otherwise.
+        """
+        measurement = self.clock.align(received)
+        return None if measurement is None else self.take(measurement)
+
+    def take(self, measurement: Measurement) -> Receipt:
+        """Fuse an event that is aligned already."""
+        if measurement.source not in self.history.index:
+            raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.plan.sources)}")
+        try:
+            values = self._values(measurement)
+        except _Unusable as unusable:
+            reason = str(unusable)
+            self.invalid[measurement.source][reason] += 1
+            outcome = self.history.count(self.history.index[measurement.source], Outcome.INVALID)
+            return Receipt(measurement, outcome, reason)
+        return Receipt(measurement, self.history.offer(measurement, values))
+
+    def estimate_at(self, t_ns: int) -> Estimate:
+        """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
+        instant before the head's gives the head itself."""
+        state = self.history.head.copy()
+        predict(state, t_ns, self.plan)
+        return self._estimate(state, t_ns)
+
+    def settled(self) -> Estimate:
+        """The estimate at the horizon, which no late event can change any more."""
+        state = self.history.settled()
+        return self._estimate(state, int(state.stamps[T]))
+
+    def outcomes(self) -> dict[str, dict[str, int]]:
+        """Counts of outcomes by source, by the last word on each event."""
+        return {
+            source: {outcome.name: int(self.history.counts[i, outcome]) for outcome in Outcome}
+            for i, source in enumerate(self.plan.sources)
+        }
+
+    def totals(self) -> dict[str, int]:
+        """Counts of outcomes over all sources."""
+        return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
+
+    def _values(self, measurement: Measurement) -> tuple[float, ...]:
+        """A payload as a row of numbers. Raises _Unusable."""
+        payload, name = measurement.payload, measurement.source.partition(".")[0]
+        if isinstance(payload, Invalid):
+            raise _Unusable(payload.reason)
+        values: tuple[float, ...]
+        if isinstance(payload, ImuSample):
+            values = (*payload.specific_force_b, *payload.angular_rate_b)
+            _finite(values)
+            _within(values, self.config.imu[name])
+        elif isinstance(payload, GnssPosition):
+            _finite((payload.latitude, payload.longitude, payload.height))
+            _on_earth(payload)
+            values = gnss_position.values(payload, self.config.gnss[name])
+        elif isinstance(payload, GnssVelocity):
+            values = gnss_velocity.values(payload, self.config.gnss[name])
+        elif isinstance(payload, WheelSpeed):
+            values = wheel_speed.values(payload, self.config.wheel[name])
+        _finite(values)
+        if isinstance(payload, GnssVelocity | WheelSpeed) and max(abs(v) for v in values[:3]) > SPEED_LIMIT:
+            raise _Unusable("impossible speed")
+        return values
+
+    def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
+        stamps = state.stamps
+        age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
+        if stamps[PHASE] != RUNNING:
+            return Estimate(t_ns, Mode.ALIGNING, age, int(stamps[RESETS]), None)
+        answer = state_estimate(state)
+        north, east, _ = answer.sigma_position_n()
+        mode = Mode.NOMINAL
+        if math.hypot(north, east) > self.plan.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
+            mode = Mode.LOST
+        elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.plan.filter.position_timeout_s):
+            mode = Mode.DEAD_RECKONING
+        return Estimate(t_ns, mode, age, int(stamps[RESETS]), answer)
+
+
+class _Unusable(Exception):
+    """A payload that must not reach the filter; the message is the reason."""
+
+
+def _finite(values: tuple[float, ...]) -> None:
+    if not all(math.isfinite(value) for value in values):
+        raise _Unusable("not finite")
+
+
+def _within(values: tuple[float, ...], imu: Imu) -> None:
+    if max(abs(v) for v in values[:3]) > imu.accel_limit or max(abs(v) for v in values[3:]) > imu.gyro_limit:
+        raise _Unusable("beyond the sensor's range")
+
+
+def _on_earth(fix: GnssPosition) -> None:
+    low, high = HEIGHT_LIMITS
+    if abs(fix.latitude) > math.pi / 2 or abs(fix.longitude) > 2 * math.pi or not low <= fix.height <= high:
+        raise _Unusable("impossible position")
+
+
+def state_estimate(state: FilterState) -> StateEstimate:
+    """A running filter state in north-east-down, as it is published."""
+    x, covariance = state.nominal, state.covariance
+    latitude, longitude, height = geodetic(x[POSITION_E])
+    to_n = mat_ne(x[POSITION_E])
+    turn = np.kron(np.eye(3), to_n)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return StateEstimate(
+        latitude=latitude,
+        longitude=longitude,
+        height=height,
+        velocity_n=_three(to_n @ x[VELOCITY_E]),
+        quaternion_nb=tuple(float(c) for c in quaternion(to_n @ matrix(x[QUATERNION_EB]))),  # type: ignore[arg-type]
+        angular_rate_b=_three(state.auxiliary[RATE_B] - x[GYRO_BIAS_B]),
+        acceleration_b=_three(state.auxiliary[FORCE_B] - x[ACCEL_BIAS_B]),
+        gyro_bias=_three(x[GYRO_BIAS_B]),
+        accel_bias=_three(x[ACCEL_BIAS_B]),
+        wheel_scale=float(x[WHEEL_SCALE.start]),
+        mount=(float(x[MOUNT][0]), float(x[MOUNT][1])),
+        covariance=turn @ covariance[: ATTITUDE.stop, : ATTITUDE.stop] @ turn.T,
+        sigma_gyro_bias=_three(sigma[GYRO_BIAS]),
+        sigma_accel_bias=_three(sigma[ACCEL_BIAS]),
+        sigma_wheel_scale=float(sigma[SCALE.start]),
+        sigma_mount=(float(sigma[MOUNT_ERROR][0]), float(sigma[MOUNT_ERROR][1])),
+    )
+
+
+def _three(vector: Array) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])

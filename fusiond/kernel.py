@@ -1,0 +1,214 @@
+"""The hot loop: runs the filter over a stretch of events in their order of time. Plain arrays in, plain arrays out.
+
+One IMU drives the propagation. Between two of its samples angular rate and specific force are interpolated linearly, and
+an interval is split exactly at a measurement's instant, so a measurement needs the IMU sample after it. Where that is
+missing, or the two lie further apart than `imu_gap`, the state coasts.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond import alignment
+from fusiond.earth import Array, mat_ne
+from fusiond.motion import constrain, watch
+from fusiond.observe import MODELS, gnss_position, gnss_velocity
+from fusiond.observe.model import CORRELATION, VALUES, Observation
+from fusiond.plan import IMU, MODEL, Plan
+from fusiond.state import (
+    BLOWN,
+    EMPTY,
+    FORCE_B,
+    HELD_FORCE_B,
+    HELD_RATE_B,
+    LAST_RATIO,
+    LAST_VALUE,
+    NEVER,
+    PHASE,
+    POSITION,
+    POSITION_E,
+    RATE_B,
+    RESETS,
+    RUNNING,
+    T_FUSED,
+    T_IMU,
+    T_LAST,
+    T_POSITION,
+    T_REJECTED,
+    VELOCITY,
+    VELOCITY_E,
+    FilterState,
+    T,
+)
+from fusiond.strapdown import coast, propagate
+from fusiond.update import correlation_factor, update
+
+
+class Outcome(IntEnum):
+    """What became of an event. FUSED: taken into the state, be it as a measurement or to align. REJECTED: stopped by the
+    innovation gate. TOO_OLD: stamped before the horizon. DUPLICATE: a second event of a source at one instant. INVALID:
+    declared unusable by its protocol, not finite, or out of bounds. WAITING: stamped after the newest IMU sample."""
+
+    FUSED = 0
+    REJECTED = 1
+    TOO_OLD = 2
+    DUPLICATE = 3
+    INVALID = 4
+    WAITING = 5
+
+
+ROW = np.dtype(
+    [
+        ("t_ns", "i8"),
+        ("sequence", "i8"),
+        ("t_receive_ns", "i8"),
+        ("source", "i4"),
+        ("outcome", "i4"),
+        ("ratio", "f8"),  # test ratio, 1 at the gate; 0 before it was judged
+        ("values", "f8", (VALUES,)),
+        ("innovation", "f8", (3,)),
+        ("variance", "f8", (3,)),  # of the innovation, diagonal
+    ]
+)
+Rows = NDArray[Any]  # structured, of dtype ROW
+
+
+def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: Plan) -> None:
+    """Take event `index` of `rows` into the state and write its outcome; `following_imu` is the index of the first IMU
+    event at or after it, or len(rows)."""
+    row = rows[index]
+    t_ns, source, values = int(row["t_ns"]), int(row["source"]), row["values"]
+    row["ratio"] = 0.0
+    if index > 0 and rows[index - 1]["t_ns"] == t_ns and rows[index - 1]["source"] == source:
+        row["outcome"] = Outcome.DUPLICATE
+        return
+    stamps = state.stamps
+    if stamps[PHASE] == EMPTY or t_ns - stamps[T] > plan.restart_gap_ns:
+        if stamps[PHASE] == RUNNING:
+            stamps[RESETS] += 1
+        alignment.begin(state)
+    row["outcome"] = Outcome.FUSED
+    if stamps[PHASE] != RUNNING:
+        alignment.gather(state, t_ns, source, values, plan)
+    else:
+        advance(state, t_ns, rows[following_imu] if following_imu < len(rows) else None, plan)
+        if plan.models[source] == IMU:
+            _hold(state, t_ns, values, plan)
+        else:
+            _measure(state, row, plan)
+        if not np.isfinite(state.numbers).all():
+            stamps[BLOWN] += 1
+            _restart_clean(state)
+    state.source_stamps[source, T_LAST] = t_ns
+
+
+def advance(state: FilterState, t_ns: int, imu: Any | None, plan: Plan) -> None:
+    """Carry the state to `t_ns`, on the IMU samples around it: the held one and `imu`, the next."""
+    stamps, auxiliary = state.stamps, state.auxiliary
+    begin = int(stamps[T])
+    if t_ns <= begin:
+        return
+    dt = (t_ns - begin) * 1e-9
+    held = int(stamps[T_IMU])
+    stamps[T] = t_ns
+    if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns:
+        coast(state, dt, plan.noise)
+        return
+    span = float(imu["t_ns"] - held)
+    middle = ((begin - held) + (t_ns - held)) / 2 / span
+    end = (t_ns - held) / span
+    sample = imu["values"]
+    force_0, rate_0 = auxiliary[HELD_FORCE_B], auxiliary[HELD_RATE_B]
+    force_change, rate_change = sample[0:3] - force_0, sample[3:6] - rate_0
+    propagate(state, dt, force_0 + middle * force_change, rate_0 + middle * rate_change, plan.noise)
+    auxiliary[FORCE_B] = force_0 + end * force_change
+    auxiliary[RATE_B] = rate_0 + end * rate_change
+
+
+def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
+    """Carry the state beyond the newest IMU sample, on that sample for at most `imu_gap`, then coasting. For publication
+    and then thrown away."""
+    stamps, auxiliary = state.stamps, state.auxiliary
+    begin = int(stamps[T])
+    if t_ns <= begin or stamps[PHASE] != RUNNING:
+        return
+    carried = max(begin, min(t_ns, int(stamps[T_IMU]) + plan.imu_gap_ns))
+    if carried > begin:
+        propagate(state, (carried - begin) * 1e-9, auxiliary[HELD_FORCE_B], auxiliary[HELD_RATE_B], plan.noise)
+    if t_ns > carried:
+        coast(state, (t_ns - carried) * 1e-9, plan.noise)
+    stamps[T] = t_ns
+
+
+def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
+    """Make an IMU sample the held one; let it tell of standstill; apply the constraints that are due."""
+    stamps, auxiliary = state.stamps, state.auxiliary
+    dt = (t_ns - int(stamps[T_IMU])) * 1e-9 if stamps[T_IMU] != NEVER else 0.0
+    stamps[T_IMU] = t_ns
+    auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = values[0:3]
+    auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = values[3:6]
+    watch(state, values[0:3], values[3:6], dt, plan)
+    constrain(state, plan)
+
+
+def _measure(state: FilterState, row: Any, plan: Plan) -> None:
+    """Judge and fuse one measurement at the state's own instant."""
+    source, t_ns = int(row["source"]), int(row["t_ns"])
+    model = plan.models[source]
+    parameters, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
+    if model == MODEL["wheel_speed"]:
+        memory[LAST_VALUE] = row["values"][0]
+    seen = MODELS[model].observe(state, row["values"], parameters)
+    assert seen is not None, "a source's model always observes"
+    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
+    seen = seen._replace(variance=seen.variance * correlation_factor(interval, parameters[CORRELATION]))
+    m = len(seen.innovation)
+    row["innovation"], row["variance"] = 0.0, 0.0
+    row["innovation"][:m] = seen.innovation
+    row["variance"][:m] = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian) + seen.variance
+    ratio, fused = update(state, seen, plan.gates[m])
+    if not fused and _locked_out(stamps, t_ns, model, plan):
+        _reset_block(state, seen, model)
+        fused = True
+    row["ratio"] = memory[LAST_RATIO] = ratio
+    if fused:
+        stamps[T_FUSED], stamps[T_REJECTED] = t_ns, NEVER
+        if model == MODEL["gnss_position"]:
+            state.stamps[T_POSITION] = t_ns
+        return
+    row["outcome"] = Outcome.REJECTED
+    if stamps[T_REJECTED] == NEVER:
+        stamps[T_REJECTED] = t_ns
+
+
+def _locked_out(stamps: NDArray[np.int64], t_ns: int, model: int, plan: Plan) -> bool:
+    """Whether a GNSS source has been rejected without a break for so long that the state is the more likely culprit."""
+    gnss = model in (MODEL["gnss_position"], MODEL["gnss_velocity"])
+    return gnss and stamps[T_REJECTED] != NEVER and t_ns - int(stamps[T_REJECTED]) >= plan.gnss_reset_ns
+
+
+def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
+    """Put position or velocity where the receiver says, with the receiver's uncertainty, and count the jump."""
+    block, nominal = (POSITION, POSITION_E) if model == MODEL["gnss_position"] else (VELOCITY, VELOCITY_E)
+    to_n = mat_ne(state.nominal[POSITION_E])
+    axes = len(seen.innovation)
+    state.nominal[nominal] += to_n[:axes].T @ seen.innovation
+    spread = to_n @ state.covariance[block, block] @ to_n.T
+    spread[:axes, :] = spread[:, :axes] = 0.0
+    spread[:axes, :axes] = np.diag(seen.variance)
+    state.covariance[block, :] = 0.0
+    state.covariance[:, block] = 0.0
+    state.covariance[block, block] = to_n.T @ spread @ to_n
+    state.stamps[RESETS] += 1
+
+
+def _restart_clean(state: FilterState) -> None:
+    """The state is no longer finite: empty it and align anew. Never expected; counted where it happens."""
+    resets, blown = int(state.stamps[RESETS]), int(state.stamps[BLOWN])
+    state.copy_from(FilterState(len(state.memory), state.size))
+    state.stamps[RESETS], state.stamps[BLOWN] = resets + 1, blown

@@ -1,0 +1,93 @@
+"""What the vehicle's motion alone tells: the standstill detector, and the constraints applied as measurements."""
+
+from __future__ import annotations
+
+import math
+
+from fusiond.earth import Array
+from fusiond.observe import CONSTRAINTS
+from fusiond.plan import SECOND, Plan
+from fusiond.state import (
+    CONSTRAINT_FUSED,
+    CONSTRAINT_RATIO,
+    CONSTRAINT_REJECTED,
+    LAST_VALUE,
+    MEAN_FORCE_B,
+    MEAN_RATE_B,
+    MEAN_WEIGHT,
+    NEVER,
+    SCATTER_FORCE,
+    SCATTER_RATE,
+    T_CONSTRAINT,
+    T_LAST,
+    T_STILL,
+    FilterState,
+    T,
+)
+from fusiond.update import update
+
+MEAN_TIME = 0.5  # s, time constant of the exponential means
+MEAN_FILLED = 0.8  # weight from which a mean is used: 0.8 s after its begin
+WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer tells nothing of standing
+NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2
+
+
+def watch(state: FilterState, force_b: Array, rate_b: Array, dt: float, plan: Plan) -> None:
+    """Take one inertial sample, `dt` [s] after the last, into the means and scatters, and decide whether the vehicle
+    stands: since when is in stamps[T_STILL]."""
+    auxiliary = state.auxiliary
+    share = -math.expm1(-dt / MEAN_TIME)
+    weight = auxiliary[MEAN_WEIGHT] + share * (1 - auxiliary[MEAN_WEIGHT])
+    auxiliary[MEAN_WEIGHT] = weight
+    step = share / weight if weight > 0 else 1.0  # the first samples count fully: no bias towards zero
+    for mean, sample, scatter in (
+        (MEAN_FORCE_B, force_b, SCATTER_FORCE),
+        (MEAN_RATE_B, rate_b, SCATTER_RATE),
+    ):
+        off = sample - auxiliary[mean]
+        auxiliary[mean] += step * off
+        auxiliary[scatter] = (1 - step) * (auxiliary[scatter] + step * float(off @ off))
+    if not stands(state, plan):
+        state.stamps[T_STILL] = NEVER
+    elif state.stamps[T_STILL] == NEVER:
+        state.stamps[T_STILL] = state.stamps[T]
+
+
+def stands(state: FilterState, plan: Plan) -> bool:
+    """Whether this instant looks like standstill: a quiet IMU, and every fresh wheel at zero (at least one, if any is
+    configured)."""
+    motion, auxiliary = plan.motion, state.auxiliary
+    if not motion.standstill or auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
+        return False
+    if auxiliary[SCATTER_FORCE] > motion.still_accel_mps2**2:
+        return False
+    if auxiliary[SCATTER_RATE] > math.radians(motion.still_gyro_deg_s) ** 2:
+        return False
+    fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
+    if plan.wheels and not fresh:
+        return False
+    return all(abs(state.memory[i, LAST_VALUE]) <= motion.still_wheel_mps for i in fresh)
+
+
+def constrain(state: FilterState, plan: Plan) -> None:
+    """Apply the constraints that hold now, if the last round is an interval ago."""
+    now = state.stamps[T]
+    if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
+        return
+    state.stamps[T_CONSTRAINT] = now
+    if state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns:
+        _apply(state, ZERO_VELOCITY, plan)
+        _apply(state, ZERO_ROTATION, plan)
+    elif plan.motion.non_holonomic:
+        _apply(state, NON_HOLONOMIC, plan)
+
+
+def _apply(state: FilterState, which: int, plan: Plan) -> None:
+    parameters = plan.constraints[which]
+    seen = CONSTRAINTS[which].observe(state, parameters, parameters)
+    if seen is None:
+        return
+    ratio, fused = update(state, seen, plan.gates[len(seen.innovation)])
+    state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
+    counts = CONSTRAINT_FUSED if fused else CONSTRAINT_REJECTED
+    state.stamps[counts.start + which] += 1

@@ -1,0 +1,42 @@
+"""GNSS position: the antenna's place, through the lever arm from the IMU. Groves (2013), equation 14.102."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusiond.config import Gnss
+from fusiond.earth import Array, ecef, mat_ne
+from fusiond.measurements import GnssPosition
+from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, mat_eb
+from fusiond.rotation import skew
+from fusiond.state import ATTITUDE, POSITION, POSITION_E, FilterState
+
+PLACE_E = slice(0, 3)  # m, values
+VARIANCE_HORIZONTAL, VARIANCE_VERTICAL = 3, 4  # m^2, values
+
+
+def parameters(gnss: Gnss) -> Array:
+    row = np.zeros(PARAMETERS)
+    row[LEVER_ARM_B] = gnss.lever_arm_m
+    row[CORRELATION] = gnss.position_correlation_s
+    return row
+
+
+def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
+    """Place (3,) earth-fixed [m], variances horizontal and vertical [m^2]: the receiver's own sigma, where it gives one,
+    but never below the configured one."""
+    horizontal = max(fix.sigma_horizontal or 0.0, gnss.position_sigma_m)
+    vertical = max(fix.sigma_vertical or 0.0, gnss.height_sigma_m)
+    return (*(float(c) for c in ecef(fix.latitude, fix.longitude, fix.height)), horizontal**2, vertical**2)
+
+
+def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+    """Innovation (3,) [m], north-east-down."""
+    to_n = mat_ne(state.nominal[POSITION_E])
+    lever_e = mat_eb(state) @ parameter[LEVER_ARM_B]
+    jacobian = np.zeros((3, state.size))
+    jacobian[:, POSITION] = to_n
+    jacobian[:, ATTITUDE] = -to_n @ skew(lever_e)
+    horizontal, vertical = row[VARIANCE_HORIZONTAL], row[VARIANCE_VERTICAL]
+    innovation = to_n @ (row[PLACE_E] - state.nominal[POSITION_E] - lever_e)
+    return Observation(innovation, jacobian, np.array([horizontal, horizontal, vertical]))

@@ -1,0 +1,76 @@
+"""What every observation model shares: its result, the plan of one source, and the kinematics of a point of the vehicle.
+
+A model is a pure function of the filter state, a row of values (the measurement) and a row of parameters (the source's
+configuration). It returns an `Observation`, or a reason why there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fusiond.earth import Array
+from fusiond.rotation import matrix, skew
+from fusiond.state import (
+    ATTITUDE,
+    GYRO_BIAS,
+    GYRO_BIAS_B,
+    MOUNT,
+    MOUNT_ERROR,
+    QUATERNION_EB,
+    RATE_B,
+    VELOCITY,
+    VELOCITY_E,
+    FilterState,
+)
+
+VALUES = 8  # width of a measurement's row
+PARAMETERS = 12  # width of a source's row
+LEVER_ARM_B = slice(0, 3)  # parameters that models share: m, the sensor from the IMU
+CORRELATION = 3  # s, over which the sensor's errors stay alike
+
+
+
+class Observation(NamedTuple):
+    """innovation d = z - h(x) : (m,), jacobian = d h / d error : (m, n), variance of z : (m,), independent axes."""
+
+    innovation: Array
+    jacobian: Array
+    variance: Array
+
+
+def mat_eb(state: FilterState) -> Array:
+    return matrix(state.nominal[QUATERNION_EB])
+
+
+def rate_b(state: FilterState) -> Array:
+    """Angular rate (3,) [rad/s] at the state's instant, freed of bias."""
+    rate: Array = state.auxiliary[RATE_B] - state.nominal[GYRO_BIAS_B]
+    return rate
+
+
+def mat_vb(pitch: float, yaw: float) -> tuple[Array, Array, Array]:
+    """Rotation (3, 3) from body to vehicle axes, Rz(yaw) Ry(pitch), and its derivatives by pitch and by yaw."""
+    cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+    rotation = np.array([[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, 0.0, cp]])
+    by_pitch = np.array([[-cy * sp, 0.0, cy * cp], [-sy * sp, 0.0, sy * cp], [-cp, 0.0, -sp]])
+    by_yaw = np.array([[-sy * cp, -cy, -sy * sp], [cy * cp, -sy, cy * sp], [0.0, 0.0, 0.0]])
+    return rotation, by_pitch, by_yaw
+
+
+def point_velocity_v(state: FilterState, point_b: Array) -> tuple[Array, Array]:
+    """Velocity over ground (3,) [m/s] in vehicle axes of a point (3,) [m] fixed to the body, and its derivative (3, n) by
+    the error state. The Earth's own rotation over a lever arm (0.07 mm/s at 1 m) is left out."""
+    x = state.nominal
+    rotation_eb = mat_eb(state)
+    velocity_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(rate_b(state), point_b)
+    rotation_vb, by_pitch, by_yaw = mat_vb(*x[MOUNT])
+    jacobian = np.zeros((3, state.size))
+    jacobian[:, VELOCITY] = rotation_vb @ rotation_eb.T
+    jacobian[:, ATTITUDE] = rotation_vb @ rotation_eb.T @ skew(x[VELOCITY_E])
+    jacobian[:, GYRO_BIAS] = rotation_vb @ skew(point_b)
+    jacobian[:, MOUNT_ERROR.start] = by_pitch @ velocity_b
+    jacobian[:, MOUNT_ERROR.start + 1] = by_yaw @ velocity_b
+    return rotation_vb @ velocity_b, jacobian

@@ -1,0 +1,25 @@
+"""Zero velocity: the vehicle stands, so its velocity over ground is nothing in every axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusiond.config import Motion
+from fusiond.earth import Array
+from fusiond.observe.model import PARAMETERS, Observation
+from fusiond.state import VELOCITY, VELOCITY_E, FilterState
+
+VARIANCE = 0  # (m/s)^2, parameters
+
+
+def parameters(motion: Motion) -> Array:
+    row = np.zeros(PARAMETERS)
+    row[VARIANCE] = motion.zero_velocity_sigma_mps**2
+    return row
+
+
+def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+    """Innovation (3,) [m/s], earth-fixed axes. There are no values."""
+    jacobian = np.zeros((3, state.size))
+    jacobian[:, VELOCITY] = np.eye(3)
+    return Observation(-state.nominal[VELOCITY_E], jacobian, np.full(3, parameter[VARIANCE]))

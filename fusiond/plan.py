@@ -1,0 +1,90 @@
+"""The configuration as the kernel wants it: numbers in arrays, one row per source, everything derived once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusiond.config import Config, Filter, Imu, Motion
+from fusiond.earth import Array
+from fusiond.observe import MODELS, gnss_position, gnss_velocity, non_holonomic, wheel_speed, zero_rotation, zero_velocity
+from fusiond.observe.model import PARAMETERS
+from fusiond.strapdown import ProcessNoise
+from fusiond.update import chi_square
+
+IMU = -1  # stands for the inertial sensor in a row's `model`
+MODEL = {model.name: number for number, model in enumerate(MODELS)}
+SECOND = 1_000_000_000  # ns
+
+
+def nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    sources: tuple[str, ...]  # sorted by name: the index of a source orders events as its name does
+    models: tuple[int, ...]  # of each source: place in MODELS, or IMU
+    parameters: Array  # (sources, PARAMETERS)
+    constraints: Array  # (3, PARAMETERS): non-holonomic, zero velocity, zero rotation
+    gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
+    noise: ProcessNoise
+    wheels: tuple[int, ...]  # indices of the sources that are wheels
+    imu_gap_ns: int
+    restart_gap_ns: int
+    gnss_reset_ns: int
+    constraint_interval_ns: int
+    still_after_ns: int
+    filter: Filter
+    motion: Motion
+    imu: Imu
+
+
+def plan(config: Config) -> Plan:
+    """Lay a configuration out for the kernel."""
+    sources = config.sources()
+    models, rows = [], []
+    for source in sources:
+        name, _, kind = source.partition(".")
+        if name in config.imu:
+            models.append(IMU)
+            rows.append(np.zeros(PARAMETERS))
+        elif kind == "position":
+            models.append(MODEL["gnss_position"])
+            rows.append(gnss_position.parameters(config.gnss[name]))
+        elif kind == "velocity":
+            models.append(MODEL["gnss_velocity"])
+            rows.append(gnss_velocity.parameters(config.gnss[name]))
+        else:
+            models.append(MODEL["wheel_speed"])
+            rows.append(wheel_speed.parameters(config.wheel[name]))
+    (imu,) = config.imu.values()
+    motion, settings = config.motion, config.filter
+    return Plan(
+        sources=sources,
+        models=tuple(models),
+        parameters=np.array(rows),
+        constraints=np.array(
+            [non_holonomic.parameters(motion), zero_velocity.parameters(motion), zero_rotation.parameters(motion)]
+        ),
+        gates=(math.inf, *(chi_square(settings.gate_probability, freedom) for freedom in (1, 2, 3))),
+        noise=ProcessNoise(
+            accel=imu.accel_noise**2,
+            gyro=imu.gyro_noise**2,
+            accel_bias=imu.accel_bias_walk**2,
+            gyro_bias=imu.gyro_bias_walk**2,
+            scale=settings.wheel_scale_walk**2 if settings.wheel_scale_sigma else 0.0,
+            mount=math.radians(settings.mount_walk_deg) ** 2 if settings.mount_sigma_deg else 0.0,
+        ),
+        wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
+        imu_gap_ns=nanoseconds(settings.imu_gap_s),
+        restart_gap_ns=nanoseconds(settings.restart_gap_s),
+        gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
+        constraint_interval_ns=nanoseconds(motion.interval_s),
+        still_after_ns=nanoseconds(motion.still_after_s),
+        filter=settings,
+        motion=motion,
+        imu=imu,
+    )

@@ -1,0 +1,114 @@
+"""The filter's whole state in two flat arrays, so that a snapshot is two copies and a compiled kernel sees plain memory.
+
+Everything that evolves lives here: the nominal state, its covariance, the inertial sample that is held, what the motion
+detector and the alignment have gathered, and what the filter remembers of each source. Position, velocity and attitude
+are kept in earth-fixed axes: there is no transport rate and no singular point, and a drive over a pole is like any
+other. North-east-down is made where people and messages want it (`fusiond.fusion`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.earth import Array
+
+Stamps = NDArray[np.int64]
+
+# Nominal state: slices of FilterState.nominal
+POSITION_E = slice(0, 3)  # m, of the IMU, earth-fixed
+VELOCITY_E = slice(3, 6)  # m/s, over ground, in earth-fixed axes
+QUATERNION_EB = slice(6, 10)  # body to earth-fixed
+GYRO_BIAS_B = slice(10, 13)  # rad/s
+ACCEL_BIAS_B = slice(13, 16)  # m/s^2
+WHEEL_SCALE = slice(16, 17)  # 1: what wheels read too much, shared by all
+MOUNT = slice(17, 19)  # rad: pitch and yaw of the IMU against the vehicle
+NOMINAL_SIZE = 19
+
+# Error state: slices of a row or column of the covariance; true = nominal (+) error
+POSITION = slice(0, 3)  # m, e axes
+VELOCITY = slice(3, 6)  # m/s, e axes
+ATTITUDE = slice(6, 9)  # rad, e axes: mat_eb_true = exp([attitude]x) mat_eb
+GYRO_BIAS = slice(9, 12)  # rad/s, b axes
+ACCEL_BIAS = slice(12, 15)  # m/s^2, b axes
+SCALE = slice(15, 16)  # 1
+MOUNT_ERROR = slice(16, 18)  # rad
+ERROR_SIZE = 18
+
+# Auxiliary numbers: slices of FilterState.auxiliary
+HELD_FORCE_B = slice(0, 3)  # m/s^2, the newest inertial sample behind the state
+HELD_RATE_B = slice(3, 6)  # rad/s
+FORCE_B = slice(6, 9)  # m/s^2, interpolated at the state's own instant
+RATE_B = slice(9, 12)  # rad/s
+MEAN_FORCE_B = slice(12, 15)  # m/s^2, exponential means and variances for leveling and for the motion detector
+MEAN_RATE_B = slice(15, 18)  # rad/s
+SCATTER_FORCE = 18  # (m/s^2)^2
+SCATTER_RATE = 19  # (rad/s)^2
+MEAN_WEIGHT = 20  # 1: how much of the mean is filled, in 0..1
+REST_RATE_B = slice(21, 24)  # rad/s, mean gyro of the last standstill before the start
+FIRST_VELOCITY_N = slice(24, 27)  # m/s, GNSS velocity at the begin of the alignment window
+FIX_E = slice(27, 30)  # m, last GNSS antenna position before the start
+FIX_VARIANCE = slice(30, 32)  # m^2, horizontal, vertical
+CONSTRAINT_RATIO = slice(32, 35)  # last test ratios: non-holonomic, zero velocity, zero rotation
+AUXILIARY_SIZE = 35
+
+# Remembered of each source: columns of FilterState.memory
+LAST_VALUE = 0  # last reading, wheels only [m/s]
+LAST_RATIO = 1  # test ratio of the last update
+MEMORY_SIZE = 2
+
+# Stamps and counts: indices of FilterState.stamps
+T = 0  # ns, instant of the state
+T_IMU = 1  # ns, of the held inertial sample
+T_CONSTRAINT = 2  # ns, of the last round of motion constraints
+T_STILL = 3  # ns, since when the vehicle stands; NEVER if it does not
+T_POSITION = 4  # ns, of the last position fused
+T_FIRST_VELOCITY = 5  # ns, begin of the alignment window
+T_FIX = 6  # ns, of FIX_E
+T_REST = 7  # ns, end of the standstill that REST_RATE_B is the mean of
+T_START = 8  # ns, when the filter began to run
+PHASE = 9  # EMPTY, ALIGNING, RUNNING
+RESETS = 10  # count of jumps of the state
+CONSTRAINT_FUSED = slice(11, 14)  # counts: non-holonomic, zero velocity, zero rotation
+CONSTRAINT_REJECTED = slice(14, 17)
+BLOWN = 17  # count of restarts because the state was no longer finite
+STAMPS_SIZE = 18
+
+# And of each source: columns of FilterState.source_stamps
+T_LAST = 0  # ns, of its last event
+T_FUSED = 1  # ns, of its last event fused
+T_REJECTED = 2  # ns, of the first of an unbroken row of rejections; NEVER if there is none
+SOURCE_STAMPS_SIZE = 3
+
+EMPTY, ALIGNING, RUNNING = 0, 1, 2
+NEVER = -(2**62)
+
+
+class FilterState:
+    """Views of the two arrays. `copy_from` and `copy` are the snapshot."""
+
+    __slots__ = ("auxiliary", "covariance", "memory", "nominal", "numbers", "size", "source_stamps", "stamps", "whole")
+
+    def __init__(self, sources: int, size: int = ERROR_SIZE) -> None:
+        """An empty state for a number of sources and of error states."""
+        self.size = size
+        ends = np.cumsum([NOMINAL_SIZE, size * size, AUXILIARY_SIZE, sources * MEMORY_SIZE])
+        self.numbers: Array = np.zeros(int(ends[-1]))
+        self.nominal: Array = self.numbers[: ends[0]]
+        self.covariance: Array = self.numbers[ends[0] : ends[1]].reshape(size, size)
+        self.auxiliary: Array = self.numbers[ends[1] : ends[2]]
+        self.memory: Array = self.numbers[ends[2] :].reshape(sources, MEMORY_SIZE)
+        self.whole: Stamps = np.full(STAMPS_SIZE + sources * SOURCE_STAMPS_SIZE, NEVER, dtype=np.int64)
+        self.stamps: Stamps = self.whole[:STAMPS_SIZE]
+        self.source_stamps: Stamps = self.whole[STAMPS_SIZE:].reshape(sources, SOURCE_STAMPS_SIZE)
+        self.stamps[PHASE:] = 0
+        self.nominal[QUATERNION_EB.start] = 1.0
+
+    def copy_from(self, other: FilterState) -> None:
+        self.numbers[:] = other.numbers
+        self.whole[:] = other.whole
+
+    def copy(self) -> FilterState:
+        twin = FilterState(len(self.memory), self.size)
+        twin.copy_from(self)
+        return twin

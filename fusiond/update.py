@@ -1,0 +1,119 @@
+"""The measurement update: innovation gate, Kalman gain, Joseph form, and the return of the error into the nominal state."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusiond.earth import Array
+from fusiond.observe.model import Observation
+from fusiond.rotation import normalised, quaternion_exp, quaternion_multiply
+from fusiond.state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_B,
+    ATTITUDE,
+    GYRO_BIAS,
+    GYRO_BIAS_B,
+    MOUNT,
+    MOUNT_ERROR,
+    POSITION,
+    POSITION_E,
+    QUATERNION_EB,
+    SCALE,
+    VELOCITY,
+    VELOCITY_E,
+    WHEEL_SCALE,
+    FilterState,
+)
+
+ADDED = (
+    (POSITION_E, POSITION),
+    (VELOCITY_E, VELOCITY),
+    (GYRO_BIAS_B, GYRO_BIAS),
+    (ACCEL_BIAS_B, ACCEL_BIAS),
+    (WHEEL_SCALE, SCALE),
+    (MOUNT, MOUNT_ERROR),
+)
+
+
+def chi_square(probability: float, freedom: int) -> float:
+    """The value that a chi-square variable of `freedom` degrees stays below with `probability` (bisection on its
+    distribution function, Abramowitz and Stegun 26.4.4, 26.4.5 and 26.4.8)."""
+
+    def distribution(x: float) -> float:
+        if freedom % 2:
+            value, term, k = math.erf(math.sqrt(x / 2)), math.sqrt(2 * x / math.pi) * math.exp(-x / 2), 1
+        else:
+            value, term, k = 1 - math.exp(-x / 2), x / 2 * math.exp(-x / 2), 2
+        while k < freedom:
+            value -= term
+            k += 2
+            term *= x / k
+        return value
+
+    low, high = 0.0, 1.0
+    while distribution(high) < probability:
+        high *= 2
+    for _ in range(200):
+        middle = (low + high) / 2
+        low, high = (middle, high) if distribution(middle) < probability else (low, middle)
+    return (low + high) / 2
+
+
+def correlation_factor(interval: float, correlation: float) -> float:
+    """How much a variance must grow so that samples every `interval` [s], whose errors stay alike over `correlation` [s]
+    (first-order Gauss-Markov), may be fused as if they were independent: (1 + r) / (1 - r) with r = exp(-dt/tau)."""
+    if correlation <= 0:
+        return 1.0
+    return 1 / math.tanh(max(interval, 1e-6) / (2 * correlation))
+
+
+def solve_spd(matrix: Array, right: Array) -> Array | None:
+    """matrix^-1 right for a symmetric positive definite matrix (m, m), by Cholesky; None where it is not."""
+    m = len(matrix)
+    lower = np.zeros((m, m))
+    for i in range(m):
+        for j in range(i + 1):
+            rest = matrix[i, j] - lower[i, :j] @ lower[j, :j]
+            if i == j:
+                if not rest > 0:
+                    return None
+                lower[i, i] = math.sqrt(rest)
+            else:
+                lower[i, j] = rest / lower[j, j]
+    solution = right.copy()
+    for i in range(m):
+        solution[i] = (solution[i] - lower[i, :i] @ solution[:i]) / lower[i, i]
+    for i in reversed(range(m)):
+        solution[i] = (solution[i] - lower[i + 1 :, i] @ solution[i + 1 :]) / lower[i, i]
+    return solution
+
+
+def update(state: FilterState, seen: Observation, gate: float) -> tuple[float, bool]:
+    """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1. Returns the ratio (infinite where S is not
+    positive definite or anything is not finite) and whether it was fused."""
+    innovation, jacobian, variance = seen
+    across = state.covariance @ jacobian.T
+    spread = jacobian @ across + np.diag(variance)
+    solved = solve_spd(spread, np.column_stack([innovation, across.T]))
+    if solved is None:
+        return math.inf, False
+    ratio = float(innovation @ solved[:, 0]) / gate
+    if not ratio <= 1:
+        return ratio if ratio > 1 else math.inf, False
+    gain = solved[:, 1:].T
+    keep = np.eye(state.size) - gain @ jacobian
+    covariance = keep @ state.covariance @ keep.T + (gain * variance) @ gain.T
+    state.covariance[:] = (covariance + covariance.T) / 2
+    inject(state, gain @ innovation)
+    return ratio, True
+
+
+def inject(state: FilterState, error: Array) -> None:
+    """Add an error (n,) to the nominal state: true = nominal (+) error. The covariance is left as it is: the turn of the
+    attitude error's axes by half the correction (Sola 2017, 6.3) is of the second order."""
+    x = state.nominal
+    for nominal, block in ADDED:
+        x[nominal] += error[block]
+    x[QUATERNION_EB] = normalised(quaternion_multiply(quaternion_exp(error[ATTITUDE]), x[QUATERNION_EB]))
