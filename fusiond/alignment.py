@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from fusiond.earth import Array, geodetic_trig, mat_ne_from_trig
+from fusiond.elementary import atan2, sin_cos
 from fusiond.motion import MEAN_FILLED, watch
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
 from fusiond.observe.model import LEVER_ARM_B
@@ -112,13 +113,13 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
         auxiliary[FIRST_VELOCITY_N] = velocity_n
         stamps[T_FIRST_VELOCITY] = stamps[T]
         return
-    speed = math.hypot(velocity_n[0], velocity_n[1])
+    speed = math.sqrt(velocity_n[0] ** 2 + velocity_n[1] ** 2)
     fresh = stamps[T_FIX] != NEVER and stamps[T] - stamps[T_FIX] <= FIX_FRESH_NS
     if window < WINDOW_LEAST_NS or speed < plan.filter.course_speed_mps or not fresh or not _leveled(state):
         return
-    course = math.atan2(velocity_n[1], velocity_n[0])
+    course = atan2(velocity_n[1], velocity_n[0])
     variance = values[gnss_velocity.VARIANCE]
-    sigma = math.hypot(math.sqrt(variance) / speed, COURSE_SIGMA)
+    sigma = math.sqrt(variance / speed**2 + COURSE_SIGMA**2)
     if plan.filter.heading_deg is not None:
         course, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
     _start(state, source, velocity_n, variance, (course, sigma), plan)
@@ -170,6 +171,7 @@ def _level(state: FilterState, velocity_n: Array, yaw: float) -> tuple[float, fl
     window = (state.stamps[T] - state.stamps[T_FIRST_VELOCITY]) * 1e-9
     if state.stamps[T_STILL] == NEVER and state.stamps[T_FIRST_VELOCITY] != NEVER and window > 0:
         north, east, _ = (velocity_n - state.auxiliary[FIRST_VELOCITY_N]) / window
-        force[0] -= math.cos(yaw) * north + math.sin(yaw) * east
-        force[1] -= math.cos(yaw) * east - math.sin(yaw) * north
-    return math.atan2(-force[1], -force[2]), math.atan2(force[0], math.hypot(force[1], force[2]))
+        sine, cosine = sin_cos(yaw)
+        force[0] -= cosine * north + sine * east
+        force[1] -= cosine * east - sine * north
+    return atan2(-force[1], -force[2]), atan2(force[0], math.sqrt(force[1] ** 2 + force[2] ** 2))

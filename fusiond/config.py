@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 from msgspec import Meta, Struct, field
@@ -165,7 +165,7 @@ class Zenoh(Section, frozen=True, kw_only=True):
     """[zenoh]: where the state is published. Loopback and no scouting unless said otherwise."""
 
     mode: Literal["peer", "client", "router"] = "peer"
-    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:0"])
+    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])
     connect: list[str] = field(default_factory=list)
     multicast_scouting: bool = False
     config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
@@ -199,30 +199,48 @@ class Config(Section, frozen=True, kw_only=True):
 def load(file: str | Path) -> Config:
     """Read and check a configuration file. Raises ConfigError."""
     path = Path(file)
+    return parse(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file. Raises ConfigError."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text") from error
-    return parse(text, path)
 
 
 def parse(text: str, path: Path = Path("config.toml")) -> Config:
     """Check the text of a configuration file; `path` serves for messages and relative names. Raises ConfigError."""
+    config = decode(text, path, Config, directory=str(path.parent))
+    refuse(_contradictions(config), text, path)
+    return config
+
+
+Table = TypeVar("Table", bound=Section)
+
+
+def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
+    """Check the text of a TOML file against a struct; `given` are fields no file may set. Raises ConfigError."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    if "directory" in table:
-        raise ConfigError(f"{path}: unknown key 'directory'")
+    for key in given:
+        if key in table:
+            raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: unknown key")
     try:
-        config = msgspec.convert(table | {"directory": str(path.parent)}, Config)
+        return msgspec.convert(table | given, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(_explain(str(error), table, text, path)) from error
-    for key, complaint in _contradictions(config):
+        raise ConfigError(_explain(str(error), table, text, path, kind=kind, given=given)) from error
+
+
+def refuse(complaints: list[tuple[str, str]], text: str, path: Path) -> None:
+    """Raise ConfigError for the first of the complaints (dotted key, what is wrong), if there is one."""
+    for key, complaint in complaints:
         raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
-    return config
 
 
 def _contradictions(config: Config) -> list[tuple[str, str]]:
@@ -261,62 +279,76 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
     return found
 
 
-def _explain(message: str, table: dict[str, object], text: str, path: Path) -> str:
+def _explain(
+    message: str, table: dict[str, object], text: str, path: Path, *, kind: type[Section], given: dict[str, object]
+) -> str:
     """msgspec's complaint, with the file's line, the dotted key and the allowed keys."""
     where = re.search(r" - at `(?:key in )?\$\.?(.*?)`$", message)
     inside = where.group(1) if where else ""
     what = message[: where.start()] if where else message
-    key = _resolve(inside, message, table)
+    key = _resolve(inside, message, table, kind)
     unknown = re.search(r"unknown field `(\w+)`", message)
     if unknown:
+        here = _kind_at(kind, key.split(".") if key else [])
+        allowed = sorted(set(here.__struct_fields__) - set(given)) if here else []
         key = f"{key}.{unknown.group(1)}" if key else unknown.group(1)
-        what = f"unknown key; allowed: {', '.join(_allowed(key))}"
+        what = f"unknown key; allowed: {', '.join(allowed)}"
     missing = re.search(r"missing required field `(\w+)`", message)
     if missing:
         what = f"the key '{missing.group(1)}' is missing"
     return f"{path}:{_line_of(key, text)}: {key or 'the file'}: {what}"
 
 
-def _resolve(inside: str, message: str, table: dict[str, object]) -> str:
+def _resolve(inside: str, message: str, table: dict[str, object], kind: type[Section]) -> str:
     """msgspec writes `[...]` for a table's name: find the name whose content has the fault."""
     if "[...]" not in inside:
         return inside
     head, tail = inside.split("[...]", 1)
     entries = table.get(head)
-    kind = _TABLES.get(head)
-    if isinstance(entries, dict) and kind is not None:
+    inner = _kind_at(kind, [head, "NAME"])
+    if isinstance(entries, dict) and inner is not None:
         for name, entry in entries.items():
             try:
-                msgspec.convert({name: entry}, dict[Name, kind])  # type: ignore[valid-type]
+                msgspec.convert({name: entry}, dict[Name, inner])  # type: ignore[valid-type]
             except msgspec.ValidationError as error:
                 if str(error) == message.replace(f"$.{head}[...]", "$[...]"):
                     return f"{head}.{name}{tail}"
     return head
 
 
-_TABLES: dict[str, type[Section]] = {"mavlink": Mavlink, "can": Can, "imu": Imu, "gnss": Gnss, "wheel": Wheel}
+def _kind_at(kind: type[Section], parts: list[str]) -> type[Section] | None:
+    """The struct whose keys may stand below a dotted key, through arrays of tables and tables of named tables."""
+    here: type[Section] | None = kind
+    named = False
+    for part in parts:
+        if named:
+            named = False
+            continue
+        types = {item.name: item.type for item in msgspec.structs.fields(here)} if here else {}
+        here, named = _section_in(types.get(part.split("[")[0]))
+    return here
 
 
-def _allowed(key: str) -> list[str]:
-    """The keys that may stand where `key` stands."""
-    parts = key.split(".")
-    if len(parts) == 1:
-        return sorted(set(Config.__struct_fields__) - {"directory"})
-    kind = _TABLES.get(parts[0])
-    if kind is None:
-        default = getattr(Config(), parts[0], None)
-        kind = type(default) if isinstance(default, Section) else None
-    return sorted(kind.__struct_fields__) if kind else []
+def _section_in(hint: object) -> tuple[type[Section] | None, bool]:
+    """The struct inside a field's type, and whether it stands in a table of named tables."""
+    if isinstance(hint, type) and issubclass(hint, Section):
+        return hint, False
+    found = [inner for inner, _ in map(_section_in, get_args(hint)) if inner is not None]
+    return (found[0], get_origin(hint) is dict) if found else (None, False)
 
 
 def _line_of(key: str, text: str) -> int:
     """The line on which a dotted key, or else the nearest table above it, stands; 1 if none does."""
     parts = key.split(".")
     table, best, depth = "", 1, 0
+    counts: dict[str, int] = {}  # of the tables in an array so far
     for number, line in enumerate(text.splitlines(), 1):
-        head = re.match(r"\s*\[+([^\]]+)\]", line)
+        head = re.match(r"\s*(\[+)([^\]]+)\]", line)
         if head:
-            table = head.group(1).strip()
+            table = head.group(2).strip()
+            if head.group(1) == "[[":
+                counts[table] = counts.get(table, -1) + 1
+                table = f"{table}[{counts[table]}]"
             shared = len([1 for a, b in zip(table.split("."), parts, strict=False) if a == b])
             if key.startswith(table) and shared > depth:
                 best, depth = number, shared

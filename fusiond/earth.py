@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.elementary import atan2, sin_cos
+
 Array = NDArray[np.float64]
 
 SEMI_MAJOR = 6378137.0  # m
@@ -27,7 +29,7 @@ GRAVITY_RATIO = EARTH_RATE**2 * SEMI_MAJOR**2 * SEMI_MINOR / GRAVITATIONAL_CONST
 
 def radii(latitude: float) -> tuple[float, float]:
     """Radii of curvature (meridian, transverse) [m] at a geodetic latitude [rad]."""
-    w2 = 1 - ECCENTRICITY2 * math.sin(latitude) ** 2
+    w2 = 1 - ECCENTRICITY2 * sin_cos(latitude)[0] ** 2
     transverse = SEMI_MAJOR / math.sqrt(w2)
     return transverse * (1 - ECCENTRICITY2) / w2, transverse
 
@@ -35,14 +37,9 @@ def radii(latitude: float) -> tuple[float, float]:
 def ecef(latitude: float, longitude: float, height: float) -> Array:
     """Earth-centred, earth-fixed position (3,) [m] of geodetic coordinates [rad, rad, m]."""
     _, transverse = radii(latitude)
-    around = (transverse + height) * math.cos(latitude)
-    return np.array(
-        [
-            around * math.cos(longitude),
-            around * math.sin(longitude),
-            (transverse * (1 - ECCENTRICITY2) + height) * math.sin(latitude),
-        ]
-    )
+    (sin_lat, cos_lat), (sin_lon, cos_lon) = sin_cos(latitude), sin_cos(longitude)
+    around = (transverse + height) * cos_lat
+    return np.array([around * cos_lon, around * sin_lon, (transverse * (1 - ECCENTRICITY2) + height) * sin_lat])
 
 
 def geodetic_trig(x: float, y: float, z: float) -> tuple[float, float, float, float]:
@@ -76,7 +73,7 @@ def geodetic(position_e: Array) -> tuple[float, float, float]:
     """Latitude, longitude [rad], height [m] of an earth-fixed position (3,) [m]."""
     x, y, z = (float(c) for c in position_e)
     sin_lat, cos_lat, sin_lon, cos_lon = geodetic_trig(x, y, z)
-    return math.atan2(sin_lat, cos_lat), math.atan2(sin_lon, cos_lon), height_of(x, y, z, sin_lat, cos_lat)
+    return atan2(sin_lat, cos_lat), atan2(sin_lon, cos_lon), height_of(x, y, z, sin_lat, cos_lat)
 
 
 def mat_ne_from_trig(sin_lat: float, cos_lat: float, sin_lon: float, cos_lon: float) -> Array:
@@ -107,7 +104,7 @@ def normal_gravity(sin_lat: float, height: float) -> float:
 
 def gravity(latitude: float, height: float) -> float:
     """Normal gravity [m/s^2] at a latitude [rad] and height [m]."""
-    return normal_gravity(math.sin(latitude), height)
+    return normal_gravity(sin_cos(latitude)[0], height)
 
 
 def gravity_e(position_e: Array) -> Array:
@@ -120,4 +117,5 @@ def gravity_e(position_e: Array) -> Array:
 
 def earth_rate_n(latitude: float) -> Array:
     """The Earth's rotation (3,) [rad/s] in north-east-down axes at a latitude [rad]."""
-    return np.array([EARTH_RATE * math.cos(latitude), 0.0, -EARTH_RATE * math.sin(latitude)])
+    sine, cosine = sin_cos(latitude)
+    return np.array([EARTH_RATE * cosine, 0.0, -EARTH_RATE * sine])

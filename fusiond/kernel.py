@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fusiond import alignment
 from fusiond.earth import Array, mat_ne
 from fusiond.motion import constrain, watch
-from fusiond.observe import MODELS, gnss_position, gnss_velocity
+from fusiond.observe import MODELS
 from fusiond.observe.model import CORRELATION, VALUES, Observation
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (

@@ -1,27 +1,26 @@
 """Events on their way into the filter: what an adapter received, and what the clock made of it. All SI, all frozen.
 
-An adapter yields `Received`: a typed payload with the sensor's own stamp (if it has one), the clock which that stamp was
+An adapter yields `Received`: a typed payload with the sensor's own stamp (if it has one), the clock that the stamp was
 read from, and the stamp of its receipt. `fusiond.clock` turns it into a `Measurement`: the same payload with one stamp
-`t_ns` on the one time line. Stamps are integers of nanoseconds everywhere; they have no defaults.
+`t_ns` on the one time line. Stamps are integers of nanoseconds everywhere; they have no defaults. The types are msgspec
+structs because a replay makes millions of them: a frozen one costs a tenth of a frozen dataclass.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 Vector3 = tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class ImuSample:
+class ImuSample(Struct, frozen=True, gc=False):
     """Inertial sample in body axes (forward, right, down)."""
 
     specific_force_b: Vector3  # m/s^2, accelerometer: (0, 0, -9.8) when level and at rest
     angular_rate_b: Vector3  # rad/s
 
 
-@dataclass(frozen=True, slots=True)
-class GnssPosition:
+class GnssPosition(Struct, frozen=True, gc=False):
     """Antenna position (WGS-84). A sigma is None where the receiver gives none."""
 
     latitude: float  # rad
@@ -31,8 +30,7 @@ class GnssPosition:
     sigma_vertical: float | None = None  # m
 
 
-@dataclass(frozen=True, slots=True)
-class GnssVelocity:
+class GnssVelocity(Struct, frozen=True, gc=False):
     """Antenna velocity over ground, north-east-down. `down` is None where the receiver gives speed and course only."""
 
     north: float  # m/s
@@ -41,15 +39,13 @@ class GnssVelocity:
     sigma: float | None = None  # m/s, one standard deviation per axis
 
 
-@dataclass(frozen=True, slots=True)
-class WheelSpeed:
+class WheelSpeed(Struct, frozen=True, gc=False):
     """Speed of one wheel's circumference along its rolling direction, positive forward."""
 
     speed: float  # m/s
 
 
-@dataclass(frozen=True, slots=True)
-class ClockPair:
+class ClockPair(Struct, frozen=True, gc=False):
     """One instant read from two clocks at once (MAVLink SYSTEM_TIME): `Received.t_sensor_ns` on `Received.clock` is
     `t_ns` on `clock`. It aligns clocks and never reaches the filter."""
 
@@ -57,8 +53,7 @@ class ClockPair:
     t_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class Invalid:
+class Invalid(Struct, frozen=True, gc=False):
     """A sample which its own protocol declares unusable (fault bit, bad checksum, no fix); counted with its reason."""
 
     reason: str
@@ -68,13 +63,13 @@ Payload = ImuSample | GnssPosition | GnssVelocity | WheelSpeed
 AnyPayload = Payload | ClockPair | Invalid
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(Struct, frozen=True, gc=False):
     """What an input adapter yields: one sample of one source, as it came in.
 
     `source` names a stream of one kind of payload (`imu0`, `gps0.position`, `gps0.velocity`, `rear_left`). `sequence`
     counts a source's samples in the order of the sensor's sending, as far as the adapter can tell. `clock` names the
-    clock of `t_sensor_ns`: `unix`, `<link>/boot`, or an empty string together with None where the sensor sends no stamp.
+    clock of `t_sensor_ns`: `unix`, `<link>/<system>/boot`, or an empty string together with None where there is no
+    stamp.
     """
 
     source: str
@@ -85,8 +80,7 @@ class Received:
     payload: AnyPayload
 
 
-@dataclass(frozen=True, slots=True)
-class Measurement:
+class Measurement(Struct, frozen=True, gc=False):
     """A payload placed on the time line: it tells of the instant `t_ns`. The order of events is `key`."""
 
     t_ns: int

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from fusiond.earth import Array
+from fusiond.elementary import exp
 from fusiond.observe import CONSTRAINTS
 from fusiond.plan import SECOND, Plan
 from fusiond.state import (
@@ -36,7 +37,7 @@ def watch(state: FilterState, force_b: Array, rate_b: Array, dt: float, plan: Pl
     """Take one inertial sample, `dt` [s] after the last, into the means and scatters, and decide whether the vehicle
     stands: since when is in stamps[T_STILL]."""
     auxiliary = state.auxiliary
-    share = -math.expm1(-dt / MEAN_TIME)
+    share = 1 - exp(-dt / MEAN_TIME)
     weight = auxiliary[MEAN_WEIGHT] + share * (1 - auxiliary[MEAN_WEIGHT])
     auxiliary[MEAN_WEIGHT] = weight
     step = share / weight if weight > 0 else 1.0  # the first samples count fully: no bias towards zero
@@ -46,7 +47,7 @@ def watch(state: FilterState, force_b: Array, rate_b: Array, dt: float, plan: Pl
     ):
         off = sample - auxiliary[mean]
         auxiliary[mean] += step * off
-        auxiliary[scatter] = (1 - step) * (auxiliary[scatter] + step * float(off @ off))
+        auxiliary[scatter] = (1 - step) * (auxiliary[scatter] + step * float(off[0] * off[0] + off[1] * off[1] + off[2] * off[2]))
     if not stands(state, plan):
         state.stamps[T_STILL] = NEVER
     elif state.stamps[T_STILL] == NEVER:

@@ -9,7 +9,15 @@ import numpy as np
 
 from fusiond.config import Config, Filter, Imu, Motion
 from fusiond.earth import Array
-from fusiond.observe import MODELS, gnss_position, gnss_velocity, non_holonomic, wheel_speed, zero_rotation, zero_velocity
+from fusiond.observe import (
+    MODELS,
+    gnss_position,
+    gnss_velocity,
+    non_holonomic,
+    wheel_speed,
+    zero_rotation,
+    zero_velocity,
+)
 from fusiond.observe.model import PARAMETERS
 from fusiond.strapdown import ProcessNoise
 from fusiond.update import chi_square

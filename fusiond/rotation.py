@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from fusiond.earth import Array
+from fusiond.elementary import asin, atan2, sin_cos
 
 
 def skew(v: Array) -> Array:
@@ -26,7 +27,8 @@ def quaternion_exp(rotation: Array) -> Array:
         scale, w = 0.5 - angle2 / 48, 1 - angle2 / 8 + angle2 * angle2 / 384
     else:
         angle = math.sqrt(angle2)
-        scale, w = math.sin(angle / 2) / angle, math.cos(angle / 2)
+        sine, w = sin_cos(angle / 2)
+        scale = sine / angle
     return np.array([w, scale * x, scale * y, scale * z])
 
 
@@ -79,7 +81,7 @@ def quaternion(mat_ab: Array) -> Array:
 
 def matrix_from_euler(roll: float, pitch: float, yaw: float) -> Array:
     """Rotation (3, 3) Rz(yaw) Ry(pitch) Rx(roll) [rad]: with body axes turned so, from body to navigation."""
-    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    (sr, cr), (sp, cp), (sy, cy) = sin_cos(roll), sin_cos(pitch), sin_cos(yaw)
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -91,6 +93,5 @@ def matrix_from_euler(roll: float, pitch: float, yaw: float) -> Array:
 
 def euler(mat_nb: Array) -> tuple[float, float, float]:
     """Roll, pitch, yaw [rad] of a rotation (3, 3); yaw in (-pi, pi]."""
-    roll = math.atan2(mat_nb[2, 1], mat_nb[2, 2])
-    pitch = math.asin(max(-1.0, min(1.0, -float(mat_nb[2, 0]))))
-    return roll, pitch, math.atan2(mat_nb[1, 0], mat_nb[0, 0])
+    roll = atan2(float(mat_nb[2, 1]), float(mat_nb[2, 2]))
+    return roll, asin(-float(mat_nb[2, 0])), atan2(float(mat_nb[1, 0]), float(mat_nb[0, 0]))

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from fusiond.earth import Array
+from fusiond.elementary import exp
 from fusiond.observe.model import Observation
 from fusiond.rotation import normalised, quaternion_exp, quaternion_multiply
 from fusiond.state import (
@@ -66,7 +67,8 @@ def correlation_factor(interval: float, correlation: float) -> float:
     (first-order Gauss-Markov), may be fused as if they were independent: (1 + r) / (1 - r) with r = exp(-dt/tau)."""
     if correlation <= 0:
         return 1.0
-    return 1 / math.tanh(max(interval, 1e-6) / (2 * correlation))
+    alike = exp(-max(interval, 1e-6) / correlation)
+    return (1 + alike) / (1 - alike)
 
 
 def solve_spd(matrix: Array, right: Array) -> Array | None:

@@ -6,12 +6,12 @@ configuration). It returns an `Observation`, or a reason why there is none.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from fusiond.earth import Array
+from fusiond.elementary import sin_cos
 from fusiond.rotation import matrix, skew
 from fusiond.state import (
     ATTITUDE,
@@ -53,7 +53,7 @@ def rate_b(state: FilterState) -> Array:
 
 def mat_vb(pitch: float, yaw: float) -> tuple[Array, Array, Array]:
     """Rotation (3, 3) from body to vehicle axes, Rz(yaw) Ry(pitch), and its derivatives by pitch and by yaw."""
-    cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+    (sp, cp), (sy, cy) = sin_cos(pitch), sin_cos(yaw)
     rotation = np.array([[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, 0.0, cp]])
     by_pitch = np.array([[-cy * sp, 0.0, cy * cp], [-sy * sp, 0.0, sy * cp], [-cp, 0.0, -sp]])
     by_yaw = np.array([[-sy * cp, -cy, -sy * sp], [cy * cp, -sy, cy * sp], [0.0, 0.0, 0.0]])
@@ -66,7 +66,7 @@ def point_velocity_v(state: FilterState, point_b: Array) -> tuple[Array, Array]:
     x = state.nominal
     rotation_eb = mat_eb(state)
     velocity_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(rate_b(state), point_b)
-    rotation_vb, by_pitch, by_yaw = mat_vb(*x[MOUNT])
+    rotation_vb, by_pitch, by_yaw = mat_vb(float(x[MOUNT.start]), float(x[MOUNT.start + 1]))
     jacobian = np.zeros((3, state.size))
     jacobian[:, VELOCITY] = rotation_vb @ rotation_eb.T
     jacobian[:, ATTITUDE] = rotation_vb @ rotation_eb.T @ skew(x[VELOCITY_E])

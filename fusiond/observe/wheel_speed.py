@@ -37,7 +37,7 @@ def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
     forward, sideways = float(velocity_v[0]), float(velocity_v[1])
     along = np.array([1.0, 0.0, 0.0])
     speed = forward
-    track = math.hypot(forward, sideways)
+    track = math.sqrt(forward * forward + sideways * sideways)
     if parameter[STEERED] and track > LEAST_TRACK_SPEED:
         speed = math.copysign(track, forward)
         along = np.array([forward / speed, sideways / speed, 0.0])
