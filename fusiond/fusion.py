@@ -13,7 +13,7 @@ from fusiond.config import Config, Imu
 from fusiond.earth import Array, geodetic, mat_ne
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.history import History
-from fusiond.kernel import Outcome, predict
+from fusiond.kernel import Outcome
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Received, WheelSpeed
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
 from fusiond.plan import SECOND, nanoseconds, plan
@@ -59,11 +59,12 @@ class Receipt(NamedTuple):
 class Fusion:
     """Clock, history and filter of one vehicle, by its configuration."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, compiled: bool | None = None) -> None:
+        """`compiled` asks for the compiled kernel or its NumPy twin; by default the compiled one where it was built."""
         self.config = config
         self.plan = plan(config)
         self.clock = Clock(config)
-        self.history = History(self.plan)
+        self.history = History(self.plan, compiled)
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 
     def receive(self, received: Received) -> Receipt | None:
@@ -91,7 +92,7 @@ class Fusion:
         """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
         instant before the head's gives the head itself."""
         state = self.history.head.copy()
-        predict(state, t_ns, self.plan)
+        self.history.kernel.predict(state, t_ns)
         return self._estimate(state, t_ns)
 
     def settled(self) -> Estimate:

@@ -18,31 +18,30 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.kernel import ROW, Outcome, Rows, step
+from fusiond.kernel import ROW, Outcome, Rows, keep, make_kernel, run_one, settles
 from fusiond.measurements import Measurement
-from fusiond.plan import IMU, Plan, nanoseconds
-from fusiond.state import NEVER, T_IMU, FilterState, T
+from fusiond.plan import IMU, Plan
+from fusiond.state import NEVER, FilterState
 
-FIRST_CAPACITY = 4096  # rows
+FIRST_ROWS = 4096
+FIRST_SNAPSHOTS = 64
 
 
 class History:
     """The events of the horizon and the filter state behind them. `counts` is (sources, outcomes), by the last word."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, compiled: bool | None = None) -> None:
         self.plan = plan
-        self.horizon_ns = nanoseconds(plan.filter.horizon_s)
-        self.snapshot_interval_ns = nanoseconds(plan.filter.snapshot_interval_s)
+        self.kernel = make_kernel(plan, compiled)
         self.index = {source: i for i, source in enumerate(plan.sources)}
         self.head = FilterState(len(plan.sources))
         self.counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
         self.rerun = 0  # rows run again because of a late event
-        self._table: Rows = np.zeros(FIRST_CAPACITY, dtype=ROW)
+        self._table: Rows = np.zeros(FIRST_ROWS, dtype=ROW)
         self._begin = self._end = 0  # the live part of the table
         self._applied = 0  # rows of the live part that are in the head
         self._newest_imu_ns = self._newest_ns = NEVER
-        # (number of rows applied, state); the first is the base, from before the first row of the table
-        self._snapshots: list[tuple[int, FilterState]] = [(0, self.head.copy())]
+        self._snapshots = Snapshots(self.head)
 
     @property
     def rows(self) -> Rows:
@@ -56,8 +55,8 @@ class History:
 
     @property
     def settled_ns(self) -> int:
-        """Nothing before this instant can change any more."""
-        return self.applied_ns - self.horizon_ns
+        """No event older than this is taken any more."""
+        return self.applied_ns - self.plan.horizon_ns
 
     def offer(self, measurement: Measurement, values: tuple[float, ...]) -> Outcome:
         """Put one event where it belongs in time and bring the head up to date. Returns its outcome, for now."""
@@ -65,17 +64,32 @@ class History:
         t_ns = measurement.t_ns
         if t_ns < self.settled_ns:
             return self.count(source, Outcome.TOO_OLD)
-        place = self._place(t_ns, source, measurement.sequence)
-        if place is None:
+        place = self.kernel.place(self._table, self._begin, self._end, t_ns, source, measurement.sequence)
+        if place < 0:
             return self.count(source, Outcome.DUPLICATE)
-        self._insert(place, measurement, source, values)
-        is_imu = self.plan.models[source] == IMU
+        if self._end == len(self._table):
+            self._make_room()
+        self.kernel.insert(
+            self._table,
+            self._begin + place,
+            self._end,
+            t_ns,
+            source,
+            measurement.sequence,
+            measurement.t_receive_ns,
+            Outcome.WAITING,
+            values,
+        )
+        self._end += 1
+        self.counts[source, Outcome.WAITING] += 1
+        if place < self._applied:  # for the moment it counts among the applied: the rewind takes it out
+            self._applied += 1
         self._newest_ns = max(self._newest_ns, t_ns)
-        if is_imu:
+        if self.plan.models[source] == IMU:
             self._newest_imu_ns = max(self._newest_imu_ns, t_ns)
-        self._rewind(self._first_changed(place, is_imu))
+        self._rewind(self.kernel.first_changed(self._table, self._begin, place))
         self._run()
-        outcome = Outcome(int(self.rows[place]["outcome"]))
+        outcome = Outcome(int(self._table["outcome"][self._begin + place]))
         self._forget()
         return outcome
 
@@ -85,111 +99,116 @@ class History:
         return outcome
 
     def settled(self) -> FilterState:
-        """The state after the last event before the horizon: what no late event can change any more."""
-        rows, limit = self.rows, self.settled_ns
-        applied, snapshot = self._snapshots[0]
-        state = snapshot.copy()
-        scratch = rows.copy()
-        for i in range(applied, self._applied):
-            if rows[i]["t_ns"] >= limit:
-                break
-            step(state, scratch, i, self._following_imu(i), self.plan)
-        return state
+        """The newest state before the horizon that no event still to come can change."""
+        rows, limit = self.rows.copy(), self.settled_ns
+        applied, state = self._snapshots.first()
+        settled, counts = state.copy(), self.counts.copy()
+        while applied < self._applied and rows[applied]["t_ns"] < limit:
+            applied = run_one(state, rows, applied, counts, self.plan)
+            if settles(state, int(rows[applied - 1]["source"]), self.plan):
+                settled.copy_from(state)
+        return settled
 
-    def _place(self, t_ns: int, source: int, sequence: int) -> int | None:
-        """Where an event goes, found from the newest backwards; None if its very key is there already."""
-        rows, key = self.rows, (t_ns, source, sequence)
-        i = len(rows)
-        while i > 0:
-            row = rows[i - 1]
-            before = int(row["t_ns"]), int(row["source"]), int(row["sequence"])
-            if before == key:
-                return None
-            if before < key:
-                break
-            i -= 1
-        return i
-
-    def _insert(self, place: int, measurement: Measurement, source: int, values: tuple[float, ...]) -> None:
-        if self._end == len(self._table):
-            live = self._end - self._begin
-            capacity = max(FIRST_CAPACITY, 4 * live)
-            table = np.zeros(capacity, dtype=ROW)
-            table[:live] = self.rows
-            self._table, self._begin, self._end = table, 0, live
-        at = self._begin + place
-        self._table[at + 1 : self._end + 1] = self._table[at : self._end]
-        self._end += 1
-        row = self._table[at]
-        row["t_ns"], row["sequence"], row["t_receive_ns"] = measurement.t_ns, measurement.sequence, measurement.t_receive_ns
-        row["source"], row["outcome"], row["ratio"] = source, Outcome.WAITING, 0.0
-        row["values"] = 0.0
-        row["values"][: len(values)] = values
-        row["innovation"], row["variance"] = 0.0, 0.0
-        self.counts[source, Outcome.WAITING] += 1
-        if place < self._applied:  # for the moment it counts among the applied: the rewind takes it out
-            self._applied += 1
-
-    def _first_changed(self, place: int, is_imu: bool) -> int:
-        if not is_imu:
-            return place
-        rows, models = self.rows, self.plan.models
-        before = place
-        while before > 0 and models[rows[before - 1]["source"]] != IMU:
-            before -= 1
-        return before
+    def _make_room(self) -> None:
+        """Move the live rows to the front of the table, or of a larger one if they fill half of it."""
+        live = self._end - self._begin
+        table = self._table if 2 * live < len(self._table) else np.zeros(4 * live, dtype=ROW)
+        table[:live] = self.rows
+        self._table, self._begin, self._end = table, 0, live
 
     def _rewind(self, first_changed: int) -> None:
         """Restore the head from the newest snapshot at or before the first changed row, if that row was applied."""
         if first_changed >= self._applied:
             return
-        while self._snapshots[-1][0] > first_changed:
-            self._snapshots.pop()
-        applied, snapshot = self._snapshots[-1]
-        self.head.copy_from(snapshot)
+        applied = self._snapshots.restore(self.head, first_changed)
         self.rerun += self._applied - applied
         self._applied = applied
 
     def _run(self) -> None:
-        """Apply the rows up to `applied_ns`, and take snapshots."""
-        rows, limit, head = self.rows, self.applied_ns, self.head
-        while self._applied < len(rows) and rows[self._applied]["t_ns"] <= limit:
-            i = self._applied
-            row = rows[i]
-            before = row["outcome"]
-            step(head, rows, i, self._following_imu(i), self.plan)
-            if row["outcome"] != before:
-                self.counts[row["source"], before] -= 1
-                self.counts[row["source"], row["outcome"]] += 1
-            self._applied = i + 1
-            if self._may_snapshot(int(row["source"])):
-                self._snapshots.append((i + 1, head.copy()))
-
-    def _following_imu(self, i: int) -> int:
-        rows, models = self.rows, self.plan.models
-        while i < len(rows) and models[rows[i]["source"]] != IMU:
-            i += 1
-        return i
-
-    def _may_snapshot(self, source: int) -> bool:
-        """Whether the head is due for a snapshot and no IMU sample still to come can change it."""
-        head, last = self.head.stamps, self._snapshots[-1][1].stamps
-        if head[T] - last[T] < self.snapshot_interval_ns:
-            return False
-        return self.plan.models[source] == IMU or bool(head[T] - head[T_IMU] > self.plan.imu_gap_ns)
+        """Apply the rows up to `applied_ns`."""
+        limit, kept = self.applied_ns, self._snapshots
+        while self._applied < self._end - self._begin and self._table["t_ns"][self._begin + self._applied] <= limit:
+            before = self._applied
+            if kept.end == len(kept.applied):
+                kept.make_room()
+            self._applied, kept.end = self.kernel.run(
+                self.head,
+                self._table,
+                self._begin,
+                self._end,
+                before,
+                limit,
+                self.counts,
+                kept.numbers,
+                kept.whole,
+                kept.applied,
+                kept.end,
+            )
+            if self._applied == before:  # not for the compiled loop: alignment, or a model written in Python
+                self._applied = run_one(self.head, self.rows, before, self.counts, self.plan)
+                kept.end = keep(
+                    self.head, self.rows, self._applied, self.plan, kept.numbers, kept.whole, kept.applied, kept.end
+                )
 
     def _forget(self) -> None:
         """Drop the rows and snapshots that no event inside the horizon can need."""
-        base, rows, limit = 0, self.rows, self.settled_ns
-        while base + 1 < len(self._snapshots):
-            applied = self._snapshots[base + 1][0]
-            if applied < len(rows) and rows[applied]["t_ns"] < limit:
-                base += 1  # every row before `applied` is older than one that is older than the horizon
-            else:
-                break
-        if base == 0:
-            return
-        gone = self._snapshots[base][0]
+        gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
         self._begin += gone
         self._applied -= gone
-        self._snapshots = [(applied - gone, state) for applied, state in self._snapshots[base:]]
+
+
+class Snapshots:
+    """Copies of the filter state, oldest first, in preallocated memory: rows begin..end of three arrays.
+
+    `applied` is the number of live rows in each. The first is the base: the state before the first live row.
+    """
+
+    def __init__(self, empty: FilterState) -> None:
+        self._empty = empty.copy()
+        self.numbers = np.zeros((FIRST_SNAPSHOTS, len(empty.numbers)))
+        self.whole: NDArray[np.int64] = np.zeros((FIRST_SNAPSHOTS, len(empty.whole)), dtype=np.int64)
+        self.applied: NDArray[np.int64] = np.zeros(FIRST_SNAPSHOTS, dtype=np.int64)
+        self.numbers[0], self.whole[0] = empty.numbers, empty.whole
+        self.begin, self.end = 0, 1
+
+    def first(self) -> tuple[int, FilterState]:
+        """The base: rows applied, and a copy of the state."""
+        state = self._empty.copy()
+        state.numbers[:], state.whole[:] = self.numbers[self.begin], self.whole[self.begin]
+        return int(self.applied[self.begin]), state
+
+    def restore(self, state: FilterState, first_changed: int) -> int:
+        """Drop the snapshots that hold a changed row, copy the newest other into `state`; returns its rows applied."""
+        while self.applied[self.end - 1] > first_changed:
+            self.end -= 1
+        state.numbers[:], state.whole[:] = self.numbers[self.end - 1], self.whole[self.end - 1]
+        return int(self.applied[self.end - 1])
+
+    def make_room(self) -> None:
+        """Move the snapshots to the front of the memory, or of a larger one if they fill half of it."""
+        live = slice(self.begin, self.end)
+        count = self.end - self.begin
+        if 2 * count < len(self.applied):
+            numbers, whole, applied = self.numbers, self.whole, self.applied
+        else:
+            room = 4 * count
+            numbers = np.zeros((room, self.numbers.shape[1]))
+            whole, applied = np.zeros((room, self.whole.shape[1]), dtype=np.int64), np.zeros(room, dtype=np.int64)
+        numbers[:count], whole[:count], applied[:count] = self.numbers[live], self.whole[live], self.applied[live]
+        self.numbers, self.whole, self.applied = numbers, whole, applied
+        self.begin, self.end = 0, count
+
+    def forget(self, stamps: NDArray[np.int64], limit_ns: int) -> int:
+        """Drop the oldest snapshots as long as the next one has an unapplied row older than the limit: every row that it
+        has applied is then as old. Returns how many rows nobody needs any more."""
+        base = self.begin
+        while base + 1 < self.end:
+            applied = self.applied[base + 1]
+            if applied >= len(stamps) or stamps[applied] >= limit_ns:
+                break
+            base += 1
+        gone = int(self.applied[base])
+        self.begin = base
+        if gone:
+            self.applied[base : self.end] -= gone
+        return gone

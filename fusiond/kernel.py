@@ -1,5 +1,8 @@
 """The hot loop: runs the filter over a stretch of events in their order of time. Plain arrays in, plain arrays out.
 
+This is the NumPy twin of the compiled `fusiond._kernel`: the same functions, by which tests hold it, and what runs where
+no compiler was found. `make_kernel` picks one.
+
 One IMU drives the propagation. Between two of its samples angular rate and specific force are interpolated linearly, and
 an interval is split exactly at a measurement's instant, so a measurement needs the IMU sample after it. Where that is
 missing, or the two lie further apart than `imu_gap`, the state coasts.
@@ -9,6 +12,8 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -23,6 +28,7 @@ from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
     EMPTY,
+    ERROR_SIZE,
     FORCE_B,
     HELD_FORCE_B,
     HELD_RATE_B,
@@ -78,6 +84,127 @@ ROW = np.dtype(
 Rows = NDArray[Any]  # structured, of dtype ROW
 
 
+def place(table: Rows, begin: int, end: int, t_ns: int, source: int, sequence: int) -> int:
+    """Where, counted from `begin`, an event goes among the rows begin..end; -1 if its very key is there already. Most
+    events are new, so the search begins at the end."""
+    i, key = end, (t_ns, source, sequence)
+    while i > begin:
+        row = table[i - 1]
+        before = int(row["t_ns"]), int(row["source"]), int(row["sequence"])
+        if before == key:
+            return -1
+        if before < key:
+            break
+        i -= 1
+    return i - begin
+
+
+def insert(
+    table: Rows,
+    at: int,
+    end: int,
+    t_ns: int,
+    source: int,
+    sequence: int,
+    t_receive_ns: int,
+    outcome: int,
+    values: tuple[float, ...],
+) -> None:
+    """Shift the rows at..end up by one and write an event into the gap."""
+    table[at + 1 : end + 1] = table[at:end]
+    row = np.zeros((), dtype=ROW)
+    row["t_ns"], row["source"], row["sequence"], row["t_receive_ns"] = t_ns, source, sequence, t_receive_ns
+    row["outcome"] = outcome
+    row["values"][: len(values)] = values
+    table[at] = row
+
+
+class Kernel:
+    """The operations of the hot loop for one plan. Stateless but for the plan."""
+
+    def __init__(self, plan: Plan, size: int = ERROR_SIZE) -> None:
+        self.plan = plan
+        self.place = place
+        self.insert = insert
+
+    def propagate(self, state: FilterState, dt: float, force_b: Array, rate_b: Array) -> None:
+        """One strapdown propagation over dt [s] (fusiond.strapdown.propagate)."""
+        propagate(state, dt, force_b, rate_b, self.plan.noise)
+
+    def predict(self, state: FilterState, t_ns: int) -> None:
+        predict(state, t_ns, self.plan)
+
+    def first_changed(self, table: Rows, begin: int, place: int) -> int:
+        """The first row whose result a new event at row `place` changes: itself, but for an IMU sample all that
+        interpolate between it and the sample before it."""
+        models = self.plan.models
+        i = begin + place
+        if models[table[i]["source"]] != IMU:
+            return place
+        while i > begin and models[table[i - 1]["source"]] != IMU:
+            i -= 1
+        return i - begin
+
+    def run(
+        self,
+        state: FilterState,
+        table: Rows,
+        begin: int,
+        end: int,
+        applied: int,
+        limit_ns: int,
+        counts: NDArray[np.int64],
+        kept_numbers: Array,
+        kept_whole: NDArray[np.int64],
+        kept_applied: NDArray[np.int64],
+        kept: int,
+    ) -> tuple[int, int]:
+        """Apply the rows from `applied` on (counted from `begin`) up to `limit_ns`, and keep snapshots in kept_*[kept:].
+        Stops when these are full. Returns the rows applied and the snapshots kept, as they are then."""
+        rows, plan = table[begin:end], self.plan
+        while applied < len(rows) and rows[applied]["t_ns"] <= limit_ns and kept < len(kept_applied):
+            applied = run_one(state, rows, applied, counts, plan)
+            kept = keep(state, rows, applied, plan, kept_numbers, kept_whole, kept_applied, kept)
+        return applied, kept
+
+
+def settles(state: FilterState, source: int, plan: Plan) -> bool:
+    """Whether no IMU sample still to come can change the state after an event of `source`: it is an IMU sample itself, or
+    the IMU has been silent for so long that the state coasts."""
+    return plan.models[source] == IMU or bool(state.stamps[T] - state.stamps[T_IMU] > plan.imu_gap_ns)
+
+
+def keep(
+    state: FilterState,
+    rows: Rows,
+    applied: int,
+    plan: Plan,
+    kept_numbers: Array,
+    kept_whole: NDArray[np.int64],
+    kept_applied: NDArray[np.int64],
+    kept: int,
+) -> int:
+    """Keep a snapshot in kept_*[kept] if one is due after `applied` rows, and lasts. Returns the snapshots kept."""
+    due = state.stamps[T] - kept_whole[kept - 1, T] >= plan.snapshot_interval_ns
+    if not due or not settles(state, int(rows[applied - 1]["source"]), plan):
+        return kept
+    kept_numbers[kept], kept_whole[kept], kept_applied[kept] = state.numbers, state.whole, applied
+    return kept + 1
+
+
+def run_one(state: FilterState, rows: Rows, index: int, counts: NDArray[np.int64], plan: Plan) -> int:
+    """Apply one row, and correct the counts if its outcome changed. Returns the index of the next."""
+    row, following = rows[index], index
+    while following < len(rows) and plan.models[rows[following]["source"]] != IMU:
+        following += 1
+    before = int(row["outcome"])
+    step(state, rows, index, following, plan)
+    if row["outcome"] != before:
+        counts[row["source"], before] -= 1
+        counts[row["source"], row["outcome"]] += 1
+    return index + 1
+
+
 def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: Plan) -> None:
     """Take event `index` of `rows` into the state and write its outcome; `following_imu` is the index of the first IMU
     event at or after it, or len(rows)."""
@@ -101,9 +228,7 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
             _hold(state, t_ns, values, plan)
         else:
             _measure(state, row, plan)
-        if not np.isfinite(state.numbers).all():
-            stamps[BLOWN] += 1
-            _restart_clean(state)
+        guard(state)
     state.source_stamps[source, T_LAST] = t_ns
 
 
@@ -207,8 +332,26 @@ def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
     state.stamps[RESETS] += 1
 
 
-def _restart_clean(state: FilterState) -> None:
-    """The state is no longer finite: empty it and align anew. Never expected; counted where it happens."""
+def guard(state: FilterState) -> None:
+    """If the state is no longer finite, empty it and align anew. Never expected; counted where it happens."""
+    if np.isfinite(state.nominal).all() and np.isfinite(np.diag(state.covariance)).all():
+        return
     resets, blown = int(state.stamps[RESETS]), int(state.stamps[BLOWN])
     state.copy_from(FilterState(len(state.memory), state.size))
-    state.stamps[RESETS], state.stamps[BLOWN] = resets + 1, blown
+    state.stamps[RESETS], state.stamps[BLOWN] = resets + 1, blown + 1
+
+
+AnyKernel = Any  # Kernel or the compiled fusiond._kernel.Kernel
+
+
+def compiled_available() -> bool:
+    """Whether the compiled kernel was built."""
+    return find_spec("fusiond._kernel") is not None
+
+
+def make_kernel(plan: Plan, compiled: bool | None = None, size: int = ERROR_SIZE) -> AnyKernel:
+    """The compiled kernel, or its twin where it was not built; `compiled` asks for one of the two. ImportError if the
+    compiled one is asked for and was not built."""
+    if compiled is None:
+        compiled = compiled_available()
+    return import_module("fusiond._kernel").Kernel(plan, size) if compiled else Kernel(plan, size)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from fusiond.earth import Array
 from fusiond.elementary import exp
 from fusiond.observe import CONSTRAINTS
@@ -62,7 +60,7 @@ def stands(state: FilterState, plan: Plan) -> bool:
         return False
     if auxiliary[SCATTER_FORCE] > motion.still_accel_mps2**2:
         return False
-    if auxiliary[SCATTER_RATE] > math.radians(motion.still_gyro_deg_s) ** 2:
+    if auxiliary[SCATTER_RATE] > plan.still_gyro**2:
         return False
     fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
     if plan.wheels and not fresh:

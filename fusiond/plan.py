@@ -40,11 +40,14 @@ class Plan:
     gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
     noise: ProcessNoise
     wheels: tuple[int, ...]  # indices of the sources that are wheels
+    horizon_ns: int
+    snapshot_interval_ns: int
     imu_gap_ns: int
     restart_gap_ns: int
     gnss_reset_ns: int
     constraint_interval_ns: int
     still_after_ns: int
+    still_gyro: float  # rad/s
     filter: Filter
     motion: Motion
     imu: Imu
@@ -87,11 +90,14 @@ def plan(config: Config) -> Plan:
             mount=math.radians(settings.mount_walk_deg) ** 2 if settings.mount_sigma_deg else 0.0,
         ),
         wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
+        horizon_ns=nanoseconds(settings.horizon_s),
+        snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
         imu_gap_ns=nanoseconds(settings.imu_gap_s),
         restart_gap_ns=nanoseconds(settings.restart_gap_s),
         gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),
+        still_gyro=math.radians(motion.still_gyro_deg_s),
         filter=settings,
         motion=motion,
         imu=imu,

@@ -1,0 +1,1143 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The compiled hot loop: what fusiond.kernel and the modules below it do for a running filter, in C.
+
+Its NumPy twin is the reference: the same equations in the same order, held together by tests. It is built without fused
+multiply-add and calls nothing of the C library but the square root, so it gives the same bits on every x86-64.
+"""
+
+from libc.math cimport INFINITY, floor, fabs, sqrt, ldexp, isfinite
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcpy, memmove, memset
+
+from fusiond import state as layout
+from fusiond import motion, observe, strapdown
+from fusiond.earth import GRAVITY_RATIO as _GRAVITY_RATIO
+from fusiond.kernel import Outcome
+from fusiond.observe import wheel_speed
+
+cdef enum:
+    MOST = 32  # error states at most
+    VALUES = 8
+    PARAMETERS = 12
+
+cdef struct Row:
+    int64_t t_ns
+    int64_t sequence
+    int64_t t_receive_ns
+    int32_t source
+    int32_t outcome
+    double ratio
+    double values[VALUES]
+    double innovation[3]
+    double variance[3]
+
+cdef struct Noise:
+    double accel, gyro, accel_bias, gyro_bias, scale, mount
+
+# The layout of fusiond.state, as offsets. `check_layout` holds them to it.
+cdef enum:
+    POSITION_E = 0
+    VELOCITY_E = 3
+    QUATERNION_EB = 6
+    GYRO_BIAS_B = 10
+    ACCEL_BIAS_B = 13
+    WHEEL_SCALE = 16
+    MOUNT = 17
+    NOMINAL_SIZE = 19
+    POSITION = 0
+    VELOCITY = 3
+    ATTITUDE = 6
+    GYRO_BIAS = 9
+    ACCEL_BIAS = 12
+    SCALE = 15
+    MOUNT_ERROR = 16
+    HELD_FORCE_B = 0
+    HELD_RATE_B = 3
+    FORCE_B = 6
+    RATE_B = 9
+    MEAN_FORCE_B = 12
+    MEAN_RATE_B = 15
+    SCATTER_FORCE = 18
+    SCATTER_RATE = 19
+    MEAN_WEIGHT = 20
+    CONSTRAINT_RATIO = 32
+    AUXILIARY_SIZE = 35
+    LAST_VALUE = 0
+    LAST_RATIO = 1
+    MEMORY_SIZE = 2
+    T = 0
+    T_IMU = 1
+    T_CONSTRAINT = 2
+    T_STILL = 3
+    T_POSITION = 4
+    PHASE = 9
+    RESETS = 10
+    CONSTRAINT_FUSED = 11
+    CONSTRAINT_REJECTED = 14
+    BLOWN = 17
+    STAMPS_SIZE = 18
+    T_LAST = 0
+    T_FUSED = 1
+    T_REJECTED = 2
+    SOURCE_STAMPS_SIZE = 3
+    RUNNING = 2
+    FUSED = 0
+    REJECTED = 1
+    DUPLICATE = 3
+    IMU = -1
+    GNSS_POSITION = 0
+    GNSS_VELOCITY = 1
+    WHEEL_SPEED = 2
+    COMPILED = 3  # models that this kernel knows; others stop it, and the twin takes one step
+
+cdef int64_t NEVER = -(<int64_t>1 << 62)
+
+cdef double SEMI_MAJOR = 6378137.0
+cdef double FLATTENING = 1 / 298.257223563
+cdef double SEMI_MINOR = SEMI_MAJOR * (1 - FLATTENING)
+cdef double ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+cdef double SECOND_ECCENTRICITY2 = ECCENTRICITY2 / (1 - ECCENTRICITY2)
+cdef double EARTH_RATE = 7.292115e-5
+cdef double GRAVITATIONAL_CONSTANT = 3.986004418e14
+cdef double EQUATOR_GRAVITY = 9.7803253359
+cdef double SOMIGLIANA = 0.00193185265241
+cdef double GRAVITY_RATIO = _GRAVITY_RATIO
+cdef double COAST_ACCEL2 = strapdown.COAST_ACCEL ** 2
+cdef double COAST_RATE2 = strapdown.COAST_RATE ** 2
+cdef double LONGEST_STEP = strapdown.LONGEST_STEP
+cdef double MEAN_TIME = motion.MEAN_TIME
+cdef double MEAN_FILLED = motion.MEAN_FILLED
+cdef int64_t WHEEL_FRESH_NS = motion.WHEEL_FRESH_NS
+cdef double LEAST_TRACK_SPEED = wheel_speed.LEAST_TRACK_SPEED
+
+
+def check_layout():
+    """The offsets above against fusiond.state; an AssertionError names what moved."""
+    for name, offset in (
+        ("POSITION_E", POSITION_E), ("VELOCITY_E", VELOCITY_E), ("QUATERNION_EB", QUATERNION_EB),
+        ("GYRO_BIAS_B", GYRO_BIAS_B), ("ACCEL_BIAS_B", ACCEL_BIAS_B), ("WHEEL_SCALE", WHEEL_SCALE), ("MOUNT", MOUNT),
+        ("POSITION", POSITION), ("VELOCITY", VELOCITY), ("ATTITUDE", ATTITUDE), ("GYRO_BIAS", GYRO_BIAS),
+        ("ACCEL_BIAS", ACCEL_BIAS), ("SCALE", SCALE), ("MOUNT_ERROR", MOUNT_ERROR), ("HELD_FORCE_B", HELD_FORCE_B),
+        ("HELD_RATE_B", HELD_RATE_B), ("FORCE_B", FORCE_B), ("RATE_B", RATE_B), ("MEAN_FORCE_B", MEAN_FORCE_B),
+        ("MEAN_RATE_B", MEAN_RATE_B), ("CONSTRAINT_RATIO", CONSTRAINT_RATIO), ("CONSTRAINT_FUSED", CONSTRAINT_FUSED),
+        ("CONSTRAINT_REJECTED", CONSTRAINT_REJECTED),
+    ):
+        assert getattr(layout, name).start == offset, name
+    for name, number in (
+        ("NOMINAL_SIZE", NOMINAL_SIZE), ("SCATTER_FORCE", SCATTER_FORCE), ("SCATTER_RATE", SCATTER_RATE),
+        ("MEAN_WEIGHT", MEAN_WEIGHT), ("AUXILIARY_SIZE", AUXILIARY_SIZE), ("LAST_VALUE", LAST_VALUE),
+        ("LAST_RATIO", LAST_RATIO), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
+        ("T_CONSTRAINT", T_CONSTRAINT), ("T_STILL", T_STILL), ("T_POSITION", T_POSITION), ("PHASE", PHASE),
+        ("RESETS", RESETS), ("BLOWN", BLOWN), ("STAMPS_SIZE", STAMPS_SIZE), ("T_LAST", T_LAST), ("T_FUSED", T_FUSED),
+        ("T_REJECTED", T_REJECTED), ("SOURCE_STAMPS_SIZE", SOURCE_STAMPS_SIZE), ("RUNNING", RUNNING), ("NEVER", NEVER),
+    ):
+        assert getattr(layout, name) == number, name
+    assert [model.name for model in observe.MODELS[:COMPILED]] == ["gnss_position", "gnss_velocity", "wheel_speed"]
+    assert (Outcome.FUSED, Outcome.REJECTED, Outcome.DUPLICATE) == (FUSED, REJECTED, DUPLICATE)
+
+
+# ---------------------------------------------------------------- elementary functions (fusiond.elementary)
+
+cdef void sin_cos(double x, double* sine_out, double* cosine_out) noexcept nogil:
+    cdef double turns = floor(x / (1.57079632673412561417 + 6.07710050650619224932e-11) + 0.5)
+    cdef double high = x - turns * 1.57079632673412561417
+    cdef double low = turns * 6.07710050650619224932e-11
+    cdef double r = high - low
+    cdef double tail = (high - r) - low
+    cdef double z = r * r
+    cdef double s = 8.33333333332248946124e-03 + z * (
+        -1.98412698298579493134e-04
+        + z * (2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)))
+    cdef double v = z * r
+    cdef double sine = r - ((z * (0.5 * tail - v * s) - tail) - v * -1.66666666666666324348e-01)
+    cdef double c = z * (4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * (
+        2.48015872894767294178e-05
+        + z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)))))
+    cdef double half = 0.5 * z
+    cdef double w = 1.0 - half
+    cdef double cosine = w + (((1.0 - w) - half) + (z * c - r * tail))
+    cdef int quadrant = (<int>turns) & 3
+    if quadrant == 0:
+        sine_out[0] = sine
+        cosine_out[0] = cosine
+    elif quadrant == 1:
+        sine_out[0] = cosine
+        cosine_out[0] = -sine
+    elif quadrant == 2:
+        sine_out[0] = -sine
+        cosine_out[0] = -cosine
+    else:
+        sine_out[0] = -cosine
+        cosine_out[0] = sine
+
+
+cdef double exponential(double x) noexcept nogil:
+    if x < -700.0:
+        return 0.0
+    if x > 700.0:
+        return INFINITY
+    cdef double k = floor(x / (6.93147180369123816490e-01 + 1.90821492927058770002e-10) + 0.5)
+    cdef double high = x - k * 6.93147180369123816490e-01
+    cdef double low = k * 1.90821492927058770002e-10
+    cdef double r = high - low
+    cdef double t = r * r
+    cdef double c = r - t * (1.66666666666666019037e-01 + t * (-2.77777777770155933842e-03 + t * (
+        6.61375632143793436117e-05 + t * (-1.65339022054652515390e-06 + t * 4.13813679705723846039e-08))))
+    cdef double y = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
+    return ldexp(y, <int>k)
+
+
+# ---------------------------------------------------------------- rotations and earth (fusiond.rotation, fusiond.earth)
+
+cdef void quaternion_exp(double* v, double* q) noexcept nogil:
+    cdef double angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    cdef double scale, w, angle, sine
+    if angle2 < 1e-8:
+        scale = 0.5 - angle2 / 48
+        w = 1 - angle2 / 8 + angle2 * angle2 / 384
+    else:
+        angle = sqrt(angle2)
+        sin_cos(angle / 2, &sine, &w)
+        scale = sine / angle
+    q[0] = w
+    q[1] = scale * v[0]
+    q[2] = scale * v[1]
+    q[3] = scale * v[2]
+
+
+cdef void quaternion_multiply(double* a, double* b, double* out) noexcept nogil:
+    out[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
+    out[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
+    out[2] = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
+    out[3] = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
+
+
+cdef void normalise(double* q) noexcept nogil:
+    cdef double norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    cdef int i
+    for i in range(4):
+        q[i] = q[i] / norm
+
+
+cdef void matrix(double* q, double* m) noexcept nogil:
+    cdef double w = q[0], x = q[1], y = q[2], z = q[3]
+    m[0] = 1 - 2 * (y * y + z * z)
+    m[1] = 2 * (x * y - w * z)
+    m[2] = 2 * (x * z + w * y)
+    m[3] = 2 * (x * y + w * z)
+    m[4] = 1 - 2 * (x * x + z * z)
+    m[5] = 2 * (y * z - w * x)
+    m[6] = 2 * (x * z - w * y)
+    m[7] = 2 * (y * z + w * x)
+    m[8] = 1 - 2 * (x * x + y * y)
+
+
+cdef void times(double* m, double* v, double* out) noexcept nogil:
+    cdef int i
+    for i in range(3):
+        out[i] = m[3 * i] * v[0] + m[3 * i + 1] * v[1] + m[3 * i + 2] * v[2]
+
+
+cdef void transposed_times(double* m, double* v, double* out) noexcept nogil:
+    cdef int i
+    for i in range(3):
+        out[i] = m[i] * v[0] + m[3 + i] * v[1] + m[6 + i] * v[2]
+
+
+cdef void cross(double* a, double* b, double* out) noexcept nogil:
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+cdef void geodetic_trig(double* r, double* sin_lat, double* cos_lat, double* sin_lon, double* cos_lon) noexcept nogil:
+    cdef double p = sqrt(r[0] * r[0] + r[1] * r[1])
+    cdef double tn = r[2] * SEMI_MAJOR, td = p * SEMI_MINOR
+    cdef double norm, sb, cb, up, out
+    cdef int i
+    if p > 0:
+        sin_lon[0] = r[1] / p
+        cos_lon[0] = r[0] / p
+    else:
+        sin_lon[0] = 0.0
+        cos_lon[0] = 1.0
+    for i in range(2):
+        norm = sqrt(tn * tn + td * td)
+        sb = tn / norm
+        cb = td / norm
+        up = r[2] + SECOND_ECCENTRICITY2 * SEMI_MINOR * sb * sb * sb
+        out = p - ECCENTRICITY2 * SEMI_MAJOR * cb * cb * cb
+        norm = sqrt(up * up + out * out)
+        sin_lat[0] = up / norm
+        cos_lat[0] = out / norm
+        tn = sin_lat[0] * SEMI_MINOR
+        td = cos_lat[0] * SEMI_MAJOR
+
+
+cdef double height_of(double* r, double sin_lat, double cos_lat) noexcept nogil:
+    cdef double root = sqrt(1 - ECCENTRICITY2 * sin_lat * sin_lat)
+    return sqrt(r[0] * r[0] + r[1] * r[1]) * cos_lat + r[2] * sin_lat - SEMI_MAJOR * root
+
+
+cdef void gravity_e(double* r, double* g) noexcept nogil:
+    cdef double sa, ca, so, co, s2, surface, ratio, strength
+    geodetic_trig(r, &sa, &ca, &so, &co)
+    s2 = sa * sa
+    surface = EQUATOR_GRAVITY * (1 + SOMIGLIANA * s2) / sqrt(1 - ECCENTRICITY2 * s2)
+    ratio = height_of(r, sa, ca) / SEMI_MAJOR
+    strength = surface * (
+        1 - 2 * ratio * (1 + FLATTENING + GRAVITY_RATIO - 2 * FLATTENING * s2) + 3 * ratio * ratio)
+    g[0] = -strength * ca * co
+    g[1] = -strength * ca * so
+    g[2] = -strength * sa
+
+
+cdef void mat_ne(double* r, double* m) noexcept nogil:
+    cdef double sa, ca, so, co
+    geodetic_trig(r, &sa, &ca, &so, &co)
+    m[0] = -sa * co
+    m[1] = -sa * so
+    m[2] = ca
+    m[3] = -so
+    m[4] = co
+    m[5] = 0.0
+    m[6] = -ca * co
+    m[7] = -ca * so
+    m[8] = -sa
+
+
+# ---------------------------------------------------------------- propagation (fusiond.strapdown)
+
+cdef void add_noise(double* p, int n, double dt, double accel, double gyro, Noise* noise) noexcept nogil:
+    cdef int i
+    cdef double cubic = accel * dt * dt / 3 * dt, square = accel * dt * dt / 2
+    for i in range(3):
+        p[(POSITION + i) * (n + 1)] += cubic
+        p[(VELOCITY + i) * (n + 1)] += accel * dt
+        p[(ATTITUDE + i) * (n + 1)] += gyro * dt
+        p[(ACCEL_BIAS + i) * (n + 1)] += noise.accel_bias * dt
+        p[(GYRO_BIAS + i) * (n + 1)] += noise.gyro_bias * dt
+        p[(POSITION + i) * n + VELOCITY + i] += square
+        p[(VELOCITY + i) * n + POSITION + i] += square
+    p[SCALE * (n + 1)] += noise.scale * dt
+    for i in range(2):
+        p[(MOUNT_ERROR + i) * (n + 1)] += noise.mount * dt
+
+
+cdef inline void axpy(double* to, double factor, double* row, int n) noexcept nogil:
+    cdef int j
+    for j in range(n):
+        to[j] += factor * row[j]
+
+
+cdef void propagate_step(double* x, double* p, int n, double dt, double* force_b, double* rate_b,
+                         Noise* noise) noexcept nogil:
+    cdef double force[3]
+    cdef double turn[3]
+    cdef double earth[3]
+    cdef double half[3]
+    cdef double q1[4]
+    cdef double q2[4]
+    cdef double q3[4]
+    cdef double c[9]
+    cdef double f[3]
+    cdef double v[3]
+    cdef double g[3]
+    cdef double free[3]
+    cdef double there[3]
+    cdef double change[3]
+    cdef double grad[9]
+    cdef double phi[9][15]  # rows of the transition matrix for position, velocity, attitude
+    cdef double top[9 * MOST]
+    cdef double corner[9][9]
+    cdef double r2, strength, total, dt2 = dt * dt / 2
+    cdef int i, j, k
+    for i in range(3):
+        force[i] = force_b[i] - x[ACCEL_BIAS_B + i]
+        turn[i] = (rate_b[i] - x[GYRO_BIAS_B + i]) * dt
+        earth[i] = 0.0
+        v[i] = x[VELOCITY_E + i]
+    earth[2] = EARTH_RATE * -dt
+    # attitude at the middle of the interval
+    for i in range(3):
+        half[i] = turn[i] / 2
+    quaternion_exp(half, q1)
+    quaternion_multiply(x + QUATERNION_EB, q1, q2)
+    for i in range(3):
+        half[i] = earth[i] / 2
+    quaternion_exp(half, q1)
+    quaternion_multiply(q1, q2, q3)
+    matrix(q3, c)
+    times(c, force, f)
+    for i in range(3):
+        there[i] = x[POSITION_E + i] + v[i] * (dt / 2)
+    gravity_e(there, g)
+    for i in range(3):
+        free[i] = f[i] + g[i]
+        half[i] = v[i] + free[i] * (dt / 2)
+    # - 2 omega x v, with omega along z
+    change[0] = (free[0] + 2 * EARTH_RATE * half[1]) * dt
+    change[1] = (free[1] - 2 * EARTH_RATE * half[0]) * dt
+    change[2] = free[2] * dt
+    r2 = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+    strength = GRAVITATIONAL_CONSTANT / (r2 * sqrt(r2))
+    for i in range(3):
+        for j in range(3):
+            grad[3 * i + j] = strength * (3 * (x[i] * x[j]) / r2 - (1.0 if i == j else 0.0))
+    for i in range(3):
+        x[POSITION_E + i] += (v[i] + change[i] / 2) * dt
+        x[VELOCITY_E + i] = v[i] + change[i]
+    quaternion_exp(turn, q1)
+    quaternion_multiply(x + QUATERNION_EB, q1, q2)
+    quaternion_exp(earth, q1)
+    quaternion_multiply(q1, q2, q3)
+    normalise(q3)
+    memcpy(x + QUATERNION_EB, q3, 4 * sizeof(double))
+
+    # transition: columns POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS; the rest is identity
+    memset(phi, 0, sizeof(phi))
+    cdef double skew[9]
+    skew[0] = 0.0
+    skew[1] = -f[2]
+    skew[2] = f[1]
+    skew[3] = f[2]
+    skew[4] = 0.0
+    skew[5] = -f[0]
+    skew[6] = -f[1]
+    skew[7] = f[0]
+    skew[8] = 0.0
+    for i in range(3):
+        phi[i][i] = 1.0
+        phi[i][VELOCITY + i] = dt
+        phi[3 + i][VELOCITY + i] = 1.0
+        phi[6 + i][ATTITUDE + i] = 1.0
+        for j in range(3):
+            phi[i][ATTITUDE + j] = skew[3 * i + j] * -dt2
+            phi[i][ACCEL_BIAS + j] = c[3 * i + j] * -dt2
+            phi[3 + i][POSITION + j] = grad[3 * i + j] * dt
+            phi[3 + i][ATTITUDE + j] = skew[3 * i + j] * -dt
+            phi[3 + i][GYRO_BIAS + j] = (
+                skew[3 * i] * c[j] + skew[3 * i + 1] * c[3 + j] + skew[3 * i + 2] * c[6 + j]) * dt2
+            phi[3 + i][ACCEL_BIAS + j] = c[3 * i + j] * -dt
+            phi[6 + i][GYRO_BIAS + j] = c[3 * i + j] * -dt
+    phi[3][VELOCITY + 1] += EARTH_RATE * (2 * dt)
+    phi[4][VELOCITY + 0] -= EARTH_RATE * (2 * dt)
+    phi[6][ATTITUDE + 1] += EARTH_RATE * dt
+    phi[7][ATTITUDE + 0] -= EARTH_RATE * dt
+
+    # P' = Phi P Phi': only the first nine rows change, and of the second factor only their own columns count
+    for i in range(9):
+        memset(top + i * n, 0, n * sizeof(double))
+        for k in range(15):
+            if phi[i][k] != 0.0:
+                axpy(top + i * n, phi[i][k], p + k * n, n)
+    for i in range(9):
+        for j in range(i, 9):
+            total = 0.0
+            for k in range(15):
+                total += top[i * n + k] * phi[j][k]
+            corner[i][j] = total
+    for i in range(9):
+        for j in range(i, 9):
+            p[i * n + j] = corner[i][j]
+            p[j * n + i] = corner[i][j]
+        for j in range(9, n):
+            p[i * n + j] = top[i * n + j]
+            p[j * n + i] = top[i * n + j]
+    add_noise(p, n, dt, noise.accel, noise.gyro, noise)
+
+
+cdef void propagate(double* x, double* p, int n, double dt, double* force_b, double* rate_b,
+                    Noise* noise) noexcept nogil:
+    cdef int parts = <int>(dt / LONGEST_STEP), i
+    if parts * LONGEST_STEP < dt:
+        parts += 1
+    if parts < 1:
+        parts = 1
+    for i in range(parts):
+        propagate_step(x, p, n, dt / parts, force_b, rate_b, noise)
+
+
+cdef void coast(double* x, double* p, int n, double dt, Noise* noise) noexcept nogil:
+    cdef int i, j
+    for i in range(3):
+        x[POSITION_E + i] += x[VELOCITY_E + i] * dt
+    for i in range(3):
+        axpy(p + i * n, dt, p + (VELOCITY + i) * n, n)
+    for i in range(n):
+        for j in range(3):
+            p[i * n + j] += dt * p[i * n + VELOCITY + j]
+    mirror(p, n)
+    add_noise(p, n, dt, COAST_ACCEL2, COAST_RATE2, noise)
+
+
+cdef void mirror(double* p, int n) noexcept nogil:
+    cdef int i, j
+    cdef double mean
+    for i in range(n):
+        for j in range(i + 1, n):
+            mean = (p[i * n + j] + p[j * n + i]) / 2
+            p[i * n + j] = mean
+            p[j * n + i] = mean
+
+
+# ---------------------------------------------------------------- observation models (fusiond.observe)
+
+cdef struct Observation:
+    int m
+    double innovation[3]
+    double jacobian[3 * MOST]
+    double variance[3]
+
+
+cdef void skew_rows(double* to_n, double* v, double sign, double* jacobian, int n, int m, int column) noexcept nogil:
+    """jacobian[:m, column:column+3] = sign * to_n @ skew(v)"""
+    cdef int i
+    cdef double* a
+    for i in range(m):
+        a = to_n + 3 * i
+        jacobian[i * n + column] = sign * (a[1] * v[2] - a[2] * v[1])
+        jacobian[i * n + column + 1] = sign * (a[2] * v[0] - a[0] * v[2])
+        jacobian[i * n + column + 2] = sign * (a[0] * v[1] - a[1] * v[0])
+
+
+cdef void gnss_position(double* x, double* row, double* parameter, int n, Observation* seen) noexcept nogil:
+    cdef double to_n[9]
+    cdef double c[9]
+    cdef double lever[3]
+    cdef double off[3]
+    cdef int i, j
+    mat_ne(x, to_n)
+    matrix(x + QUATERNION_EB, c)
+    times(c, parameter, lever)
+    seen.m = 3
+    memset(seen.jacobian, 0, 3 * n * sizeof(double))
+    for i in range(3):
+        off[i] = row[i] - x[POSITION_E + i] - lever[i]
+        for j in range(3):
+            seen.jacobian[i * n + POSITION + j] = to_n[3 * i + j]
+    skew_rows(to_n, lever, -1.0, seen.jacobian, n, 3, ATTITUDE)
+    times(to_n, off, seen.innovation)
+    seen.variance[0] = row[3]
+    seen.variance[1] = row[3]
+    seen.variance[2] = row[4]
+
+
+cdef void gnss_velocity(double* x, double* auxiliary, double* row, double* parameter, int n,
+                        Observation* seen) noexcept nogil:
+    cdef double to_n[9]
+    cdef double c[9]
+    cdef double turned[9]
+    cdef double rate[3]
+    cdef double swing_b[3]
+    cdef double swing[3]
+    cdef double v[3]
+    cdef double h[3]
+    cdef int i, j, m = <int>row[4]
+    mat_ne(x, to_n)
+    matrix(x + QUATERNION_EB, c)
+    for i in range(3):
+        rate[i] = auxiliary[RATE_B + i] - x[GYRO_BIAS_B + i]
+    cross(rate, parameter, swing_b)
+    times(c, swing_b, swing)
+    seen.m = m
+    memset(seen.jacobian, 0, m * n * sizeof(double))
+    for i in range(m):
+        for j in range(3):
+            seen.jacobian[i * n + VELOCITY + j] = to_n[3 * i + j]
+            turned[3 * i + j] = to_n[3 * i] * c[j] + to_n[3 * i + 1] * c[3 + j] + to_n[3 * i + 2] * c[6 + j]
+    skew_rows(to_n, swing, -1.0, seen.jacobian, n, m, ATTITUDE)
+    skew_rows(turned, parameter, 1.0, seen.jacobian, n, m, GYRO_BIAS)
+    for i in range(3):
+        v[i] = x[VELOCITY_E + i] + swing[i]
+    times(to_n, v, h)
+    for i in range(m):
+        seen.innovation[i] = row[i] - h[i]
+        seen.variance[i] = row[3]
+
+
+cdef void point_velocity(double* x, double* auxiliary, double* point, int n, int first, int last, double* velocity,
+                         double* jacobian) noexcept nogil:
+    """Velocity (3,) in vehicle axes of a point, and rows first..last of its derivative, n wide each."""
+    cdef double c[9]
+    cdef double rate[3]
+    cdef double swing[3]
+    cdef double vb[3]
+    cdef double r[9]
+    cdef double turned[9]
+    cdef double sp, cp, sy, cy
+    cdef int i, j, k
+    matrix(x + QUATERNION_EB, c)
+    for i in range(3):
+        rate[i] = auxiliary[RATE_B + i] - x[GYRO_BIAS_B + i]
+    cross(rate, point, swing)
+    transposed_times(c, x + VELOCITY_E, vb)
+    for i in range(3):
+        vb[i] = vb[i] + swing[i]
+    sin_cos(x[MOUNT], &sp, &cp)
+    sin_cos(x[MOUNT + 1], &sy, &cy)
+    r[0] = cy * cp
+    r[1] = -sy
+    r[2] = cy * sp
+    r[3] = sy * cp
+    r[4] = cy
+    r[5] = sy * sp
+    r[6] = -sp
+    r[7] = 0.0
+    r[8] = cp
+    times(r, vb, velocity)
+    memset(jacobian + first * n, 0, (last - first) * n * sizeof(double))
+    for i in range(first, last):
+        for j in range(3):
+            # rotation_vb @ rotation_eb.T
+            turned[3 * i + j] = r[3 * i] * c[3 * j] + r[3 * i + 1] * c[3 * j + 1] + r[3 * i + 2] * c[3 * j + 2]
+            jacobian[i * n + VELOCITY + j] = turned[3 * i + j]
+    skew_rows(turned + 3 * first, x + VELOCITY_E, 1.0, jacobian + first * n, n, last - first, ATTITUDE)
+    skew_rows(r + 3 * first, point, 1.0, jacobian + first * n, n, last - first, GYRO_BIAS)
+    cdef double by[6]
+    by[0] = -cy * sp * vb[0] + cy * cp * vb[2]
+    by[1] = -sy * cp * vb[0] - cy * vb[1] - sy * sp * vb[2]
+    by[2] = -sy * sp * vb[0] + sy * cp * vb[2]
+    by[3] = cy * cp * vb[0] - sy * vb[1] + cy * sp * vb[2]
+    by[4] = -cp * vb[0] - sp * vb[2]
+    by[5] = 0.0
+    for i in range(first, last):
+        for k in range(2):
+            jacobian[i * n + MOUNT_ERROR + k] = by[2 * i + k]
+
+
+cdef void wheel(double* x, double* auxiliary, double* row, double* parameter, int n, Observation* seen) noexcept nogil:
+    cdef double v[3]
+    cdef double by[3 * MOST]
+    cdef double speed, track, along, across = 0.0, scale = 1 + x[WHEEL_SCALE], reading = row[0]
+    cdef int j, rows = 2 if parameter[4] != 0.0 else 1
+    point_velocity(x, auxiliary, parameter, n, 0, rows, v, by)
+    speed = v[0]
+    along = 1.0
+    track = sqrt(v[0] * v[0] + v[1] * v[1])
+    if rows == 2 and track > LEAST_TRACK_SPEED:
+        speed = track if v[0] >= 0 else -track
+        along = v[0] / speed
+        across = v[1] / speed
+        for j in range(n):
+            seen.jacobian[j] = scale * (along * by[j] + across * by[n + j])
+    else:
+        for j in range(n):
+            seen.jacobian[j] = scale * by[j]
+    seen.jacobian[SCALE] = speed
+    if parameter[5] != 0.0 and reading > 0 and speed < 0:
+        reading = -reading
+    seen.m = 1
+    seen.innovation[0] = reading - scale * speed
+    seen.variance[0] = row[1]
+
+
+# ---------------------------------------------------------------- update (fusiond.update)
+
+cdef double update(double* x, double* p, int n, Observation* seen, double gate, double* spread_diagonal) noexcept nogil:
+    """Fuse unless the test ratio exceeds 1; returns the ratio. Infinite: S is not positive definite or not finite."""
+    cdef double across[3][MOST]
+    cdef double gain[3][MOST]
+    cdef double kept[3][MOST]
+    cdef double s[3][3]
+    cdef double low[3][3]
+    cdef double solved[3]
+    cdef double error[MOST]
+    cdef double part[4]
+    cdef double turned[4]
+    cdef double ratio = 0.0, rest, h
+    cdef int i, j, k, a, m = seen.m
+    for a in range(m):
+        memset(across[a], 0, n * sizeof(double))
+        for k in range(n):
+            h = seen.jacobian[a * n + k]
+            if h != 0.0:
+                axpy(across[a], h, p + k * n, n)
+    for a in range(m):
+        for i in range(a + 1):
+            rest = 0.0
+            for k in range(n):
+                rest += seen.jacobian[a * n + k] * across[i][k]
+            s[a][i] = rest
+            s[i][a] = rest
+        s[a][a] += seen.variance[a]
+        if spread_diagonal != NULL:
+            spread_diagonal[a] = s[a][a]
+    for i in range(m):
+        for j in range(i + 1):
+            rest = s[i][j]
+            for k in range(j):
+                rest -= low[i][k] * low[j][k]
+            if i == j:
+                if not rest > 0:
+                    return INFINITY
+                low[i][i] = sqrt(rest)
+            else:
+                low[i][j] = rest / low[j][j]
+    for i in range(m):
+        rest = seen.innovation[i]
+        for k in range(i):
+            rest -= low[i][k] * solved[k]
+        solved[i] = rest / low[i][i]
+        ratio += solved[i] * solved[i]
+    ratio = ratio / gate
+    if not ratio <= 1:
+        return ratio if ratio > 1 else INFINITY
+    # gain' = S^-1 (P H')'
+    for i in range(m):
+        for j in range(n):
+            gain[i][j] = across[i][j]
+        for k in range(i):
+            axpy(gain[i], -low[i][k], gain[k], n)
+        for j in range(n):
+            gain[i][j] = gain[i][j] / low[i][i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            axpy(gain[i], -low[k][i], gain[k], n)
+        for j in range(n):
+            gain[i][j] = gain[i][j] / low[i][i]
+    # Joseph: A = P - K (H P); P = A - (A H') K' + K R K'
+    for a in range(m):
+        for i in range(n):
+            axpy(p + i * n, -gain[a][i], across[a], n)
+    for a in range(m):
+        for i in range(n):
+            rest = 0.0
+            for k in range(n):
+                rest += p[i * n + k] * seen.jacobian[a * n + k]
+            kept[a][i] = seen.variance[a] * gain[a][i] - rest
+    for a in range(m):
+        for i in range(n):
+            axpy(p + i * n, kept[a][i], gain[a], n)
+    mirror(p, n)
+    for j in range(n):
+        error[j] = 0.0
+    for a in range(m):
+        axpy(error, seen.innovation[a], gain[a], n)
+    for i in range(3):
+        x[POSITION_E + i] += error[POSITION + i]
+        x[VELOCITY_E + i] += error[VELOCITY + i]
+        x[GYRO_BIAS_B + i] += error[GYRO_BIAS + i]
+        x[ACCEL_BIAS_B + i] += error[ACCEL_BIAS + i]
+    x[WHEEL_SCALE] += error[SCALE]
+    x[MOUNT] += error[MOUNT_ERROR]
+    x[MOUNT + 1] += error[MOUNT_ERROR + 1]
+    quaternion_exp(error + ATTITUDE, part)
+    quaternion_multiply(part, x + QUATERNION_EB, turned)
+    normalise(turned)
+    memcpy(x + QUATERNION_EB, turned, 4 * sizeof(double))
+    return ratio
+
+
+# ---------------------------------------------------------------- the loop (fusiond.kernel, fusiond.motion)
+
+cdef class Kernel:
+    """The compiled counterpart of fusiond.kernel.Kernel, for one plan."""
+
+    cdef int n, sources
+    cdef int32_t[::1] models
+    cdef double[:, ::1] parameters
+    cdef double[:, ::1] constraints
+    cdef double gates[4]
+    cdef Noise noise
+    cdef int64_t imu_gap, restart_gap, gnss_reset, constraint_interval, still_after, snapshot_interval
+    cdef bint standstill, non_holonomic
+    cdef double still_wheel, still_gyro2, still_accel2
+    cdef double[::1] own_numbers  # of the state being run
+    cdef double* x
+    cdef double* p
+    cdef double* auxiliary
+    cdef double* memory
+    cdef int64_t* stamps
+    cdef int64_t* source_stamps
+    cdef int numbers_size
+
+    def __init__(self, plan, int size):
+        import numpy as np
+        check_layout()
+        if size > MOST:
+            raise ValueError(f"at most {MOST} error states, not {size}")
+        self.n = size
+        self.sources = len(plan.sources)
+        self.models = np.array(plan.models, dtype=np.int32)
+        self.parameters = np.ascontiguousarray(plan.parameters)
+        self.constraints = np.ascontiguousarray(plan.constraints)
+        for i in range(4):
+            self.gates[i] = plan.gates[i]
+        noise = plan.noise
+        self.noise = Noise(noise.accel, noise.gyro, noise.accel_bias, noise.gyro_bias, noise.scale, noise.mount)
+        self.imu_gap = plan.imu_gap_ns
+        self.restart_gap = plan.restart_gap_ns
+        self.gnss_reset = plan.gnss_reset_ns
+        self.constraint_interval = plan.constraint_interval_ns
+        self.still_after = plan.still_after_ns
+        self.snapshot_interval = plan.snapshot_interval_ns
+        self.standstill = plan.motion.standstill
+        self.non_holonomic = plan.motion.non_holonomic
+        self.still_wheel = plan.motion.still_wheel_mps
+        self.still_gyro2 = plan.still_gyro ** 2
+        self.still_accel2 = plan.motion.still_accel_mps2 ** 2
+        self.numbers_size = NOMINAL_SIZE + size * size + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
+
+    cdef int bind(self, double[::1] numbers, int64_t[::1] whole) except -1:
+        if numbers.shape[0] != self.numbers_size:
+            raise ValueError(f"a state of {self.numbers_size} numbers is needed, not {numbers.shape[0]}")
+        if whole.shape[0] != STAMPS_SIZE + self.sources * SOURCE_STAMPS_SIZE:
+            raise ValueError("a state of other sources")
+        self.x = &numbers[0]
+        self.p = self.x + NOMINAL_SIZE
+        self.auxiliary = self.p + self.n * self.n
+        self.memory = self.auxiliary + AUXILIARY_SIZE
+        self.stamps = &whole[0]
+        self.source_stamps = self.stamps + STAMPS_SIZE
+        return 0
+
+    def propagate(self, state, double dt, double[::1] force_b, double[::1] rate_b):
+        """fusiond.strapdown.propagate"""
+        self.bind(state.numbers, state.whole)
+        propagate(self.x, self.p, self.n, dt, &force_b[0], &rate_b[0], &self.noise)
+
+    def predict(self, state, int64_t t_ns):
+        """fusiond.kernel.predict"""
+        self.bind(state.numbers, state.whole)
+        cdef int64_t begin = self.stamps[T], carried
+        if t_ns <= begin or self.stamps[PHASE] != RUNNING:
+            return
+        carried = self.stamps[T_IMU] + self.imu_gap
+        if t_ns < carried:
+            carried = t_ns
+        if carried < begin:
+            carried = begin
+        if carried > begin:
+            propagate(self.x, self.p, self.n, (carried - begin) * 1e-9, self.auxiliary + HELD_FORCE_B,
+                      self.auxiliary + HELD_RATE_B, &self.noise)
+        if t_ns > carried:
+            coast(self.x, self.p, self.n, (t_ns - carried) * 1e-9, &self.noise)
+        self.stamps[T] = t_ns
+
+    def place(self, const Row[::1] table, Py_ssize_t begin, Py_ssize_t end, int64_t t_ns, int32_t source,
+              int64_t sequence):
+        """fusiond.kernel.place"""
+        cdef Py_ssize_t i = end
+        cdef const Row* row
+        while i > begin:
+            row = &table[i - 1]
+            if row.t_ns < t_ns:
+                break
+            if row.t_ns == t_ns:
+                if row.source < source:
+                    break
+                if row.source == source:
+                    if row.sequence == sequence:
+                        return -1
+                    if row.sequence < sequence:
+                        break
+            i -= 1
+        return i - begin
+
+    def insert(self, Row[::1] table, Py_ssize_t at, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence,
+               int64_t t_receive_ns, int32_t outcome, tuple values):
+        """fusiond.kernel.insert"""
+        cdef Row* row = &table[at]
+        cdef Py_ssize_t i
+        memmove(row + 1, row, (end - at) * sizeof(Row))
+        memset(row, 0, sizeof(Row))
+        row.t_ns = t_ns
+        row.source = source
+        row.sequence = sequence
+        row.t_receive_ns = t_receive_ns
+        row.outcome = outcome
+        for i in range(len(values)):
+            row.values[i] = values[i]
+
+    def first_changed(self, const Row[::1] table, Py_ssize_t begin, Py_ssize_t place):
+        """fusiond.kernel.first_changed"""
+        cdef Py_ssize_t i = begin + place
+        if self.models[table[i].source] != IMU:
+            return place
+        while i > begin and self.models[table[i - 1].source] != IMU:
+            i -= 1
+        return i - begin
+
+    def run(self, state, Row[::1] table, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, int64_t limit_ns,
+            int64_t[:, ::1] counts, double[:, ::1] kept_numbers, int64_t[:, ::1] kept_whole, int64_t[::1] kept_applied,
+            Py_ssize_t kept):
+        """fusiond.kernel.Kernel.run"""
+        cdef double[::1] numbers = state.numbers
+        cdef int64_t[::1] whole = state.whole
+        self.bind(numbers, whole)
+        cdef Row* rows = &table[0] + begin
+        cdef Py_ssize_t count = end - begin, following = applied, room = kept_applied.shape[0]
+        cdef int32_t before
+        cdef int64_t last
+        cdef bint safe
+        cdef Row* row
+        with nogil:
+            while applied < count and rows[applied].t_ns <= limit_ns:
+                row = rows + applied
+                if kept == room or self.stamps[PHASE] != RUNNING or self.models[row.source] >= COMPILED:
+                    break
+                if row.t_ns - self.stamps[T] > self.restart_gap:
+                    break
+                if following < applied:
+                    following = applied
+                while following < count and self.models[rows[following].source] != IMU:
+                    following += 1
+                before = row.outcome
+                self.step(rows, applied, rows + following if following < count else NULL, whole.shape[0])
+                if row.outcome != before:
+                    counts[row.source, before] -= 1
+                    counts[row.source, row.outcome] += 1
+                applied += 1
+                last = kept_whole[kept - 1, T]
+                safe = self.models[row.source] == IMU or self.stamps[T] - self.stamps[T_IMU] > self.imu_gap
+                if safe and self.stamps[T] - last >= self.snapshot_interval:
+                    memcpy(&kept_numbers[kept, 0], self.x, self.numbers_size * sizeof(double))
+                    memcpy(&kept_whole[kept, 0], self.stamps, whole.shape[0] * sizeof(int64_t))
+                    kept_applied[kept] = applied
+                    kept += 1
+        return applied, kept
+
+    cdef void step(self, Row* rows, Py_ssize_t index, Row* imu, Py_ssize_t whole_size) noexcept nogil:
+        cdef Row* row = rows + index
+        row.ratio = 0.0
+        if index > 0 and rows[index - 1].t_ns == row.t_ns and rows[index - 1].source == row.source:
+            row.outcome = DUPLICATE
+            return
+        row.outcome = FUSED
+        self.advance(row.t_ns, imu)
+        if self.models[row.source] == IMU:
+            self.hold(row)
+        else:
+            self.measure(row)
+        self.guard(whole_size)
+        self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] = row.t_ns
+
+    cdef void guard(self, Py_ssize_t whole_size) noexcept nogil:
+        """fusiond.kernel.guard: a state that is no longer finite is emptied, and aligns anew."""
+        cdef double total = 0.0
+        cdef int64_t resets, blown
+        cdef Py_ssize_t i
+        for i in range(NOMINAL_SIZE):
+            total += self.x[i]
+        for i in range(self.n):
+            total += self.p[i * (self.n + 1)]
+        if isfinite(total):
+            return
+        resets = self.stamps[RESETS]
+        blown = self.stamps[BLOWN]
+        memset(self.x, 0, self.numbers_size * sizeof(double))
+        self.x[QUATERNION_EB] = 1.0
+        for i in range(whole_size):
+            self.stamps[i] = NEVER
+        for i in range(PHASE, STAMPS_SIZE):
+            self.stamps[i] = 0
+        self.stamps[RESETS] = resets + 1
+        self.stamps[BLOWN] = blown + 1
+
+    cdef void advance(self, int64_t t_ns, Row* imu) noexcept nogil:
+        cdef int64_t begin = self.stamps[T], held = self.stamps[T_IMU]
+        cdef double dt, span, middle, end, change
+        cdef double force[3]
+        cdef double rate[3]
+        cdef double* a = self.auxiliary
+        cdef int i
+        if t_ns <= begin:
+            return
+        dt = (t_ns - begin) * 1e-9
+        self.stamps[T] = t_ns
+        if imu == NULL or held == NEVER or imu.t_ns - held > self.imu_gap:
+            coast(self.x, self.p, self.n, dt, &self.noise)
+            return
+        span = <double>(imu.t_ns - held)
+        middle = <double>((begin - held) + (t_ns - held)) / 2 / span
+        end = <double>(t_ns - held) / span
+        for i in range(3):
+            change = imu.values[i] - a[HELD_FORCE_B + i]
+            force[i] = a[HELD_FORCE_B + i] + middle * change
+            a[FORCE_B + i] = a[HELD_FORCE_B + i] + end * change
+            change = imu.values[3 + i] - a[HELD_RATE_B + i]
+            rate[i] = a[HELD_RATE_B + i] + middle * change
+            a[RATE_B + i] = a[HELD_RATE_B + i] + end * change
+        propagate(self.x, self.p, self.n, dt, force, rate, &self.noise)
+
+    cdef void hold(self, Row* row) noexcept nogil:
+        cdef double* a = self.auxiliary
+        cdef double dt = 0.0
+        cdef int i
+        if self.stamps[T_IMU] != NEVER:
+            dt = (row.t_ns - self.stamps[T_IMU]) * 1e-9
+        self.stamps[T_IMU] = row.t_ns
+        for i in range(3):
+            a[HELD_FORCE_B + i] = row.values[i]
+            a[FORCE_B + i] = row.values[i]
+            a[HELD_RATE_B + i] = row.values[3 + i]
+            a[RATE_B + i] = row.values[3 + i]
+        self.watch(row, dt)
+        self.constrain()
+
+    cdef void watch(self, Row* row, double dt) noexcept nogil:
+        cdef double* a = self.auxiliary
+        cdef double share = 1 - exponential(-dt / MEAN_TIME)
+        cdef double weight = a[MEAN_WEIGHT] + share * (1 - a[MEAN_WEIGHT])
+        cdef double step
+        cdef double off[3]
+        cdef int i, which, mean
+        a[MEAN_WEIGHT] = weight
+        step = share / weight if weight > 0 else 1.0
+        for which in range(2):
+            mean = MEAN_RATE_B if which else MEAN_FORCE_B
+            for i in range(3):
+                off[i] = row.values[3 * which + i] - a[mean + i]
+                a[mean + i] += step * off[i]
+            a[SCATTER_FORCE + which] = (1 - step) * (
+                a[SCATTER_FORCE + which] + step * (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]))
+        if not self.stands():
+            self.stamps[T_STILL] = NEVER
+        elif self.stamps[T_STILL] == NEVER:
+            self.stamps[T_STILL] = self.stamps[T]
+
+    cdef bint stands(self) noexcept nogil:
+        cdef int i, wheels = 0, fresh = 0
+        if not self.standstill or self.auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
+            return False
+        if self.auxiliary[SCATTER_FORCE] > self.still_accel2 or self.auxiliary[SCATTER_RATE] > self.still_gyro2:
+            return False
+        for i in range(self.sources):
+            if self.models[i] == WHEEL_SPEED:
+                wheels += 1
+                if self.stamps[T] - self.source_stamps[i * SOURCE_STAMPS_SIZE + T_LAST] <= WHEEL_FRESH_NS:
+                    fresh += 1
+                    if not fabs(self.memory[i * MEMORY_SIZE + LAST_VALUE]) <= self.still_wheel:
+                        return False
+        return fresh > 0 or wheels == 0
+
+    cdef void constrain(self) noexcept nogil:
+        cdef int64_t now = self.stamps[T]
+        cdef Observation seen
+        cdef double v[3]
+        cdef double by[3 * MOST]
+        cdef double c[9]
+        cdef double earth[3]
+        cdef double* parameter
+        cdef int i, j, n = self.n
+        if now - self.stamps[T_CONSTRAINT] < self.constraint_interval:
+            return
+        self.stamps[T_CONSTRAINT] = now
+        if self.stamps[T_STILL] != NEVER and now - self.stamps[T_STILL] >= self.still_after:
+            seen.m = 3
+            memset(seen.jacobian, 0, 3 * n * sizeof(double))
+            for i in range(3):
+                seen.jacobian[i * n + VELOCITY + i] = 1.0
+                seen.innovation[i] = -self.x[VELOCITY_E + i]
+                seen.variance[i] = self.constraints[1, 0]
+            self.apply(1, &seen)
+            matrix(self.x + QUATERNION_EB, c)
+            memset(seen.jacobian, 0, 3 * n * sizeof(double))
+            for i in range(3):
+                seen.jacobian[i * n + GYRO_BIAS + i] = 1.0
+                # mat_eb' @ skew(earth rate along z)
+                seen.jacobian[i * n + ATTITUDE] = c[3 + i] * EARTH_RATE
+                seen.jacobian[i * n + ATTITUDE + 1] = -(c[i] * EARTH_RATE)
+                seen.innovation[i] = (
+                    self.auxiliary[RATE_B + i] - self.x[GYRO_BIAS_B + i] - c[6 + i] * EARTH_RATE)
+                seen.variance[i] = self.constraints[2, 0]
+            self.apply(2, &seen)
+        elif self.non_holonomic:
+            parameter = &self.constraints[0, 0]
+            point_velocity(self.x, self.auxiliary, parameter, n, 1, 3, v, by)
+            if fabs(v[0]) < parameter[5]:
+                return
+            seen.m = 2
+            memcpy(seen.jacobian, by + n, 2 * n * sizeof(double))
+            for i in range(2):
+                seen.innovation[i] = -v[1 + i]
+                seen.variance[i] = parameter[3 + i]
+            self.apply(0, &seen)
+
+    cdef void apply(self, int which, Observation* seen) noexcept nogil:
+        cdef double ratio = update(self.x, self.p, self.n, seen, self.gates[seen.m], NULL)
+        self.auxiliary[CONSTRAINT_RATIO + which] = ratio
+        self.stamps[(CONSTRAINT_FUSED if ratio <= 1 else CONSTRAINT_REJECTED) + which] += 1
+
+    cdef void measure(self, Row* row) noexcept nogil:
+        cdef int model = self.models[row.source], a
+        cdef double* parameter = &self.parameters[row.source, 0]
+        cdef double* memory = self.memory + row.source * MEMORY_SIZE
+        cdef int64_t* stamps = self.source_stamps + row.source * SOURCE_STAMPS_SIZE
+        cdef Observation seen
+        cdef double factor = 1.0, interval, alike, ratio
+        if model == WHEEL_SPEED:
+            memory[LAST_VALUE] = row.values[0]
+            wheel(self.x, self.auxiliary, row.values, parameter, self.n, &seen)
+        elif model == GNSS_POSITION:
+            gnss_position(self.x, row.values, parameter, self.n, &seen)
+        else:
+            gnss_velocity(self.x, self.auxiliary, row.values, parameter, self.n, &seen)
+        if parameter[3] > 0 and stamps[T_FUSED] != NEVER:
+            interval = (row.t_ns - stamps[T_FUSED]) * 1e-9
+            if interval < 1e-6:
+                interval = 1e-6
+            alike = exponential(-interval / parameter[3])
+            factor = (1 + alike) / (1 - alike)
+        for a in range(3):
+            row.innovation[a] = 0.0
+            row.variance[a] = 0.0
+        for a in range(seen.m):
+            seen.variance[a] = seen.variance[a] * factor
+            row.innovation[a] = seen.innovation[a]
+        ratio = update(self.x, self.p, self.n, &seen, self.gates[seen.m], row.variance)
+        row.ratio = ratio
+        memory[LAST_RATIO] = ratio
+        if not ratio <= 1 and model != WHEEL_SPEED and stamps[T_REJECTED] != NEVER \
+                and row.t_ns - stamps[T_REJECTED] >= self.gnss_reset:
+            self.reset_block(&seen, POSITION if model == GNSS_POSITION else VELOCITY)
+            ratio = 1.0
+        if ratio <= 1:
+            stamps[T_FUSED] = row.t_ns
+            stamps[T_REJECTED] = NEVER
+            if model == GNSS_POSITION:
+                self.stamps[T_POSITION] = row.t_ns
+        else:
+            row.outcome = REJECTED
+            if stamps[T_REJECTED] == NEVER:
+                stamps[T_REJECTED] = row.t_ns
+
+    cdef void reset_block(self, Observation* seen, int block) noexcept nogil:
+        cdef double to_n[9]
+        cdef double spread[9]
+        cdef double half[9]
+        cdef double* p = self.p
+        cdef int i, j, k, n = self.n, m = seen.m
+        mat_ne(self.x, to_n)
+        for i in range(3):
+            for j in range(3):
+                half[3 * i + j] = 0.0
+                for k in range(3):
+                    half[3 * i + j] += to_n[3 * i + k] * p[(block + k) * n + block + j]
+        for i in range(3):
+            for j in range(3):
+                spread[3 * i + j] = 0.0
+                for k in range(3):
+                    spread[3 * i + j] += half[3 * i + k] * to_n[3 * j + k]
+        for i in range(3):
+            for j in range(3):
+                if i < m or j < m:
+                    spread[3 * i + j] = seen.variance[i] if i == j else 0.0
+        for i in range(3):
+            for k in range(m):
+                self.x[block + i] += to_n[3 * k + i] * seen.innovation[k]
+            for j in range(n):
+                p[(block + i) * n + j] = 0.0
+                p[j * n + block + i] = 0.0
+        for i in range(3):
+            for j in range(3):
+                half[3 * i + j] = 0.0
+                for k in range(3):
+                    half[3 * i + j] += to_n[3 * k + i] * spread[3 * k + j]
+        for i in range(3):
+            for j in range(3):
+                p[(block + i) * n + block + j] = 0.0
+                for k in range(3):
+                    p[(block + i) * n + block + j] += half[3 * i + k] * to_n[3 * k + j]
+        self.stamps[RESETS] += 1
