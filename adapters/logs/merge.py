@@ -1,0 +1,164 @@
+"""Several logs of one drive as one stream of `Received`, in the order of arrival."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from operator import itemgetter
+from pathlib import Path
+
+from fusiond.config import Config
+from fusiond.measurements import Received
+
+from ..can import CanDecoder
+from ..mavlink import MavlinkDecoder
+from . import LogError, LogInput, canlog
+from .canlog import read_can_log
+from .tlog import read_tlog
+
+KNOWN = ".tlog, .log (candump -L), .asc, .blf, .trc, .csv, .db, .mf4; all but .db and .mf4 also with .gz"
+
+
+def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
+    """Make ready to read the logs of one drive. Nothing but their size is looked at yet.
+
+    A path is that of a .tlog or a CAN log, by its suffix. A .tlog belongs to the first [mavlink.NAME]; a CAN log may
+    hold any [can.NAME], told apart by channel (see `canlog`). `LINK=path` or `BUS=path` says whose it is.
+    Raises LogError for a path that cannot be a log, ConfigError for a configuration that does not fit its DBC files.
+    """
+    if not paths:
+        raise LogError("no log given")
+    sequences: dict[str, int] = {}
+    return LogSet([_open(str(path), config, sequences) for path in paths])
+
+
+class LogSet:
+    """The logs of one drive; iterating, once, yields their events merged by `t_receive_ns`.
+
+    Each log keeps its own order. Where its stamps run back, an event is placed as if received with the latest one
+    before it, so that nothing is lost and no other log is held up. Ties go by the order in which the logs were given.
+    Iterating raises LogError where a file turns out to be no log.
+    """
+
+    def __init__(self, logs: Sequence[_Log]) -> None:
+        self._logs = logs
+        self._begun = False
+
+    def __iter__(self) -> Iterator[Received]:
+        if self._begun:
+            raise RuntimeError("a LogSet is read once")
+        self._begun = True
+        placed = (log.placed() for log in self._logs)
+        return map(itemgetter(1), heapq.merge(*placed, key=itemgetter(0)))
+
+    @property
+    def bytes_total(self) -> int:
+        """Size of all files on disk."""
+        return sum(log.file.bytes_total for log in self._logs)
+
+    @property
+    def bytes_read(self) -> int:
+        """How much of `bytes_total` has been read."""
+        return sum(log.file.bytes_read for log in self._logs)
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]:
+        """What became of the content, by log; counts that are 0 are left out."""
+        return {str(log.file.path): log.counts() for log in self._logs}
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know about the logs, complete once they are read."""
+        found = [warning for log in self._logs for warning in log.file.warnings]
+        found += [f"{log.file.path}: nothing in it that the configuration asks for" for log in self._logs if log.barren]
+        links = [log for log in self._logs if log.first_ns is not None and log.is_mavlink]
+        buses = [log for log in self._logs if log.first_ns is not None and not log.is_mavlink]
+        if links and buses and not any(link.overlaps(bus) for link in links for bus in buses):
+            spans = "; ".join(log.span() for log in (*links, *buses))
+            found.append(f"the MAVLink and the CAN logs do not overlap in time: {spans}")
+        return found
+
+
+class _Log:
+    """One log, its decoders, and the stamps seen in it."""
+
+    def __init__(
+        self, file: LogInput, decoders: Sequence[MavlinkDecoder | CanDecoder], events: Iterator[Received]
+    ) -> None:
+        self.file = file
+        self.is_mavlink = isinstance(decoders[0], MavlinkDecoder)
+        self.first_ns: int | None = None
+        self.last_ns = 0
+        self.barren = False  # read to its end without an event
+        self._decoders = decoders
+        self._events = events
+
+    def placed(self) -> Iterator[tuple[int, Received]]:
+        """The events, each with the greatest receive stamp so far."""
+        latest_ns: int | None = None
+        for event in self._events:
+            t_ns = event.t_receive_ns
+            if latest_ns is None or self.first_ns is None:
+                latest_ns = self.first_ns = self.last_ns = t_ns
+            elif t_ns >= latest_ns:
+                latest_ns = self.last_ns = t_ns
+            else:
+                self.first_ns = min(self.first_ns, t_ns)
+                self.file.counts["stamps run back"] += 1
+            yield latest_ns, event
+        self.barren = latest_ns is None
+        self.file.bytes_read = self.file.bytes_total
+
+    def counts(self) -> dict[str, int]:
+        total = self.file.counts.copy()
+        for decoder in self._decoders:
+            total.update(decoder.counts)
+        return {name: count for name, count in total.items() if count}
+
+    def overlaps(self, other: _Log) -> bool:
+        if self.first_ns is None or other.first_ns is None:
+            return False
+        return self.first_ns <= other.last_ns and other.first_ns <= self.last_ns
+
+    def span(self) -> str:
+        first, last = (_readable(t_ns) for t_ns in (self.first_ns or 0, self.last_ns))
+        return f"{self.file.path} from {first} to {last}"
+
+
+def _readable(t_ns: int) -> str:
+    seconds = t_ns // 10**9
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _open(argument: str, config: Config, sequences: dict[str, int]) -> _Log:
+    name, path = _split(argument, config)
+    file = LogInput(path)
+    if file.suffix == ".tlog":
+        if not config.mavlink:
+            raise LogError(f"{path}: the configuration has no [mavlink.NAME] to take it for")
+        link = name if name is not None else next(iter(config.mavlink))
+        if link not in config.mavlink:
+            raise LogError(f"{argument}: a .tlog is a MAVLink log; configured links: {', '.join(config.mavlink)}")
+        decoder = MavlinkDecoder(config, link, sequences)
+        return _Log(file, [decoder], read_tlog(file, decoder))
+    if file.suffix not in canlog.SUFFIXES or (file.zipped and file.suffix in canlog.UNZIPPED_ONLY):
+        raise LogError(f"{path}: unknown kind of log; known: {KNOWN}")
+    if not config.can:
+        raise LogError(f"{path}: the configuration has no [can.NAME] to take it for")
+    if name is not None and name not in config.can:
+        raise LogError(f"{argument}: a {file.suffix} is a CAN log; configured buses: {', '.join(config.can)}")
+    buses = config.can if name is None else (name,)
+    decoders = {bus: CanDecoder(config, bus, sequences) for bus in buses}
+    return _Log(file, list(decoders.values()), read_can_log(file, decoders, config, named=name is not None))
+
+
+def _split(argument: str, config: Config) -> tuple[str | None, str]:
+    """`NAME=path` into its parts; a `=` that does not follow a link's or bus's name belongs to the path."""
+    name, equals, path = argument.partition("=")
+    if equals and (name in config.mavlink or name in config.can):
+        return name, path
+    if equals and name.isidentifier() and not Path(argument).exists():
+        known = ", ".join((*config.mavlink, *config.can)) or "none"
+        raise LogError(f"{argument}: there is no link or bus '{name}'; configured: {known}")
+    return None, argument

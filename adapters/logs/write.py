@@ -1,0 +1,143 @@
+"""Writes a simulated drive to files in the true wire formats: .tlog, candump .log, DBC, and what goes with them."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from operator import itemgetter
+from pathlib import Path
+from struct import Struct
+
+import numpy as np
+from pymavlink.dialects.v20 import common
+
+from fusiond.simulation import wheels
+from fusiond.simulation.drive import Drive, simulate
+from fusiond.simulation.gnss import UNKNOWN_16
+from fusiond.simulation.matching import configuration, dbc
+from fusiond.simulation.scenario import Scenario
+from fusiond.simulation.truth import Truth
+from fusiond.simulation.wire import SYSTEM
+
+STAMP = Struct(">Q")  # microseconds of Unix time
+COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
+ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
+HDOP, VDOP, SATELLITES = 80, 120, 14  # of a fix; the first two in hundredths
+CHANNEL = "can0"
+TRUTH_COLUMNS = "unix_us,lat_deg,lon_deg,height_m,vn_mps,ve_mps,vd_mps,roll_deg,pitch_deg,yaw_deg"
+TRUTH_ROW = "%d,%.9f,%.9f,%.4f,%.5f,%.5f,%.5f,%.5f,%.5f,%.5f\n"
+
+Stamped = Iterator[tuple[int, int, common.MAVLink_message]]  # receipt [us], frame counter, message
+
+
+def write_drive(scenario: Scenario, directory: str | Path, seed: int | None = None) -> list[Path]:
+    """Simulate a drive and write it; `seed` in place of the scenario's own. The folder is made if need be.
+
+    Returns the files: drive.tlog, drive.log, wheels.dbc, truth.csv, fusiond.toml. Raises OSError.
+    """
+    folder = Path(directory)
+    folder.mkdir(parents=True, exist_ok=True)
+    drive = simulate(scenario, seed)
+    names = ("drive.tlog", "drive.log", "wheels.dbc", "truth.csv", "fusiond.toml")
+    tlog, candump, dbc_file, truth, config = paths = [folder / name for name in names]
+    write_tlog(drive, tlog)
+    write_candump(drive, candump)
+    write_truth(drive.truth, scenario.truth_rate_hz, truth)
+    dbc_file.write_text(dbc(scenario), encoding="utf-8")
+    config.write_text(configuration(scenario, dbc_file.name), encoding="utf-8")
+    return paths
+
+
+def write_tlog(drive: Drive, path: Path) -> None:
+    """The MAVLink messages in the order of receipt, as MAVLink 2 frames behind their stamps."""
+    link = common.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    streams = (_imu(drive), _gnss(drive), _system_time(drive), _heartbeats(drive))
+    with path.open("wb") as file:
+        for t_us, counter, message in heapq.merge(*streams, key=itemgetter(0)):
+            link.seq = counter
+            file.write(STAMP.pack(t_us) + message.pack(link))
+
+
+def _imu(drive: Drive) -> Stamped:
+    imu = drive.imu
+    columns = (imu.t_receive_us, imu.counter, imu.time_us, imu.specific_force_b, imu.angular_rate_b)
+    unused = (0.0,) * 7  # magnetometer, pressures, temperature
+    for t_us, counter, time_us, force, rate in zip(*(column.tolist() for column in columns), strict=True):
+        yield t_us, counter, common.MAVLink_highres_imu_message(time_us, *force, *rate, *unused, ACCEL_AND_GYRO, 0)
+
+
+def _gnss(drive: Drive) -> Stamped:
+    gnss, fixes = drive.gnss, drive.gnss.fixes
+    fields = (fixes.fix_type, fixes.lat, fixes.lon, fixes.alt, fixes.alt_ellipsoid, fixes.vel, fixes.cog)
+    columns = (gnss.t_receive_us, gnss.counter, gnss.time_us, *fields)
+    for t_us, counter, time_us, fix_type, lat, lon, alt, ellipsoid, vel, cog in zip(
+        *(column.tolist() for column in columns), strict=True
+    ):
+        known = vel != UNKNOWN_16
+        yield t_us, counter, common.MAVLink_gps_raw_int_message(
+            time_usec=time_us,
+            fix_type=fix_type,
+            lat=lat,
+            lon=lon,
+            alt=alt,
+            eph=HDOP if known else UNKNOWN_16,
+            epv=VDOP if known else UNKNOWN_16,
+            vel=vel,
+            cog=cog,
+            satellites_visible=SATELLITES if known else 0,
+            alt_ellipsoid=ellipsoid,
+            h_acc=fixes.h_acc,
+            v_acc=fixes.v_acc,
+            vel_acc=fixes.vel_acc,
+        )
+
+
+def _system_time(drive: Drive) -> Stamped:
+    columns = (drive.time.t_receive_us, drive.time.counter, drive.time.unix_us, drive.time.boot_ms)
+    for t_us, counter, unix_us, boot_ms in zip(*(column.tolist() for column in columns), strict=True):
+        yield t_us, counter, common.MAVLink_system_time_message(unix_us, boot_ms)
+
+
+def _heartbeats(drive: Drive) -> Stamped:
+    columns = (drive.heartbeats.t_receive_us, drive.heartbeats.counter)
+    for t_us, counter in zip(*(column.tolist() for column in columns), strict=True):
+        yield t_us, counter, common.MAVLink_heartbeat_message(
+            type=common.MAV_TYPE_GROUND_ROVER,
+            autopilot=common.MAV_AUTOPILOT_GENERIC,
+            base_mode=0,
+            custom_mode=0,
+            system_status=common.MAV_STATE_ACTIVE,
+            mavlink_version=3,
+        )
+
+
+def write_candump(drive: Drive, path: Path) -> None:
+    """The CAN frames in the order of receipt, as `candump -L` writes them."""
+    frames = drive.wheels
+    data = wheels.frames(frames.raw, frames.fault, frames.counter)
+    streams = [
+        _lines(wheels.FRAME_ID, frames.t_receive_us.tolist(), data.tolist()),
+        *(_lines(other.identifier, other.t_receive_us.tolist(), other.data.tolist()) for other in drive.chatter),
+    ]
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(line for _, line in heapq.merge(*streams, key=itemgetter(0)))
+
+
+def _lines(identifier: int, stamps_us: list[int], data: list[int]) -> Iterator[tuple[int, str]]:
+    for t_us, word in zip(stamps_us, data, strict=True):
+        yield t_us, f"({t_us // 1_000_000}.{t_us % 1_000_000:06d}) {CHANNEL} {identifier:03X}#{word:016X}\n"
+
+
+def write_truth(truth: Truth, rate_hz: float, path: Path) -> None:
+    """The truth about the IMU, at most `rate_hz` rows a second; `unix_us` is the receiving host's time."""
+    interval_ns = int(np.diff(truth.t_ns[:2]).sum()) or 1
+    every = max(1, round(1e9 / rate_hz / interval_ns))
+    angles = np.degrees(np.column_stack([truth.latitude, truth.longitude, truth.euler]))[::every]
+    columns = (truth.t_ns // 1000, truth.height, truth.velocity_n)
+    stamps, heights, velocities = (column[::every].tolist() for column in columns)
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.write(TRUTH_COLUMNS + "\n")
+        for t_us, height, velocity, (lat, lon, *attitude) in zip(
+            stamps, heights, velocities, angles.tolist(), strict=True
+        ):
+            file.write(TRUTH_ROW % (t_us, lat, lon, height, *velocity, *attitude))
