@@ -743,8 +743,14 @@ cdef class Kernel:
     cdef int64_t imu_gap, restart_gap, gnss_reset, constraint_interval, still_after, snapshot_interval
     cdef bint standstill, non_holonomic
     cdef double still_wheel, still_gyro2, still_accel2
-    cdef double[::1] own_numbers  # of the state being run
-    cdef double* x
+    cdef double[::1] head_numbers
+    cdef int64_t[::1] head_whole
+    cdef Row[::1] table
+    cdef int64_t[:, ::1] counts
+    cdef double[:, ::1] kept_numbers
+    cdef int64_t[:, ::1] kept_whole
+    cdef int64_t[::1] kept_applied
+    cdef double* x  # of the state that is bound
     cdef double* p
     cdef double* auxiliary
     cdef double* memory
@@ -815,13 +821,23 @@ cdef class Kernel:
             coast(self.x, self.p, self.n, (t_ns - carried) * 1e-9, &self.noise)
         self.stamps[T] = t_ns
 
-    def place(self, const Row[::1] table, Py_ssize_t begin, Py_ssize_t end, int64_t t_ns, int32_t source,
-              int64_t sequence):
-        """fusiond.kernel.place"""
+    def attach(self, head, Row[::1] table, int64_t[:, ::1] counts, double[:, ::1] kept_numbers,
+               int64_t[:, ::1] kept_whole, int64_t[::1] kept_applied):
+        """fusiond.kernel.Kernel.attach"""
+        self.head_numbers = head.numbers
+        self.head_whole = head.whole
+        self.table = table
+        self.counts = counts
+        self.kept_numbers = kept_numbers
+        self.kept_whole = kept_whole
+        self.kept_applied = kept_applied
+
+    def place(self, Py_ssize_t begin, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence):
+        """fusiond.kernel.Kernel.place"""
         cdef Py_ssize_t i = end
         cdef const Row* row
         while i > begin:
-            row = &table[i - 1]
+            row = &self.table[i - 1]
             if row.t_ns < t_ns:
                 break
             if row.t_ns == t_ns:
@@ -835,10 +851,10 @@ cdef class Kernel:
             i -= 1
         return i - begin
 
-    def insert(self, Row[::1] table, Py_ssize_t at, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence,
+    def insert(self, Py_ssize_t at, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence,
                int64_t t_receive_ns, int32_t outcome, tuple values):
-        """fusiond.kernel.insert"""
-        cdef Row* row = &table[at]
+        """fusiond.kernel.Kernel.insert"""
+        cdef Row* row = &self.table[at]
         cdef Py_ssize_t i
         memmove(row + 1, row, (end - at) * sizeof(Row))
         memset(row, 0, sizeof(Row))
@@ -849,31 +865,44 @@ cdef class Kernel:
         row.outcome = outcome
         for i in range(len(values)):
             row.values[i] = values[i]
+        self.counts[source, outcome] += 1
 
-    def first_changed(self, const Row[::1] table, Py_ssize_t begin, Py_ssize_t place):
-        """fusiond.kernel.first_changed"""
+    def first_changed(self, Py_ssize_t begin, Py_ssize_t place):
+        """fusiond.kernel.Kernel.first_changed"""
         cdef Py_ssize_t i = begin + place
-        if self.models[table[i].source] != IMU:
+        if self.models[self.table[i].source] != IMU:
             return place
-        while i > begin and self.models[table[i - 1].source] != IMU:
+        while i > begin and self.models[self.table[i - 1].source] != IMU:
             i -= 1
         return i - begin
 
-    def run(self, state, Row[::1] table, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, int64_t limit_ns,
-            int64_t[:, ::1] counts, double[:, ::1] kept_numbers, int64_t[:, ::1] kept_whole, int64_t[::1] kept_applied,
-            Py_ssize_t kept):
+    def outcome(self, Py_ssize_t at):
+        """fusiond.kernel.Kernel.outcome"""
+        return self.table[at].outcome
+
+    def restore(self, Py_ssize_t kept, Py_ssize_t first_changed):
+        """fusiond.kernel.Kernel.restore"""
+        while self.kept_applied[kept - 1] > first_changed:
+            kept -= 1
+        memcpy(&self.head_numbers[0], &self.kept_numbers[kept - 1, 0], self.head_numbers.shape[0] * sizeof(double))
+        memcpy(&self.head_whole[0], &self.kept_whole[kept - 1, 0], self.head_whole.shape[0] * sizeof(int64_t))
+        return kept
+
+    def run(self, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, int64_t limit_ns, Py_ssize_t kept):
         """fusiond.kernel.Kernel.run"""
-        cdef double[::1] numbers = state.numbers
-        cdef int64_t[::1] whole = state.whole
-        self.bind(numbers, whole)
-        cdef Row* rows = &table[0] + begin
-        cdef Py_ssize_t count = end - begin, following = applied, room = kept_applied.shape[0]
+        cdef Row* rows = &self.table[0] + begin
+        cdef Py_ssize_t count = end - begin, following = applied, room = self.kept_applied.shape[0]
+        cdef Py_ssize_t whole_size = self.head_whole.shape[0]
         cdef int32_t before
         cdef int64_t last
-        cdef bint safe
+        cdef bint safe, done = False
         cdef Row* row
+        self.bind(self.head_numbers, self.head_whole)
         with nogil:
-            while applied < count and rows[applied].t_ns <= limit_ns:
+            while True:
+                if applied >= count or rows[applied].t_ns > limit_ns:
+                    done = True
+                    break
                 row = rows + applied
                 if kept == room or self.stamps[PHASE] != RUNNING or self.models[row.source] >= COMPILED:
                     break
@@ -884,19 +913,19 @@ cdef class Kernel:
                 while following < count and self.models[rows[following].source] != IMU:
                     following += 1
                 before = row.outcome
-                self.step(rows, applied, rows + following if following < count else NULL, whole.shape[0])
+                self.step(rows, applied, rows + following if following < count else NULL, whole_size)
                 if row.outcome != before:
-                    counts[row.source, before] -= 1
-                    counts[row.source, row.outcome] += 1
+                    self.counts[row.source, before] -= 1
+                    self.counts[row.source, row.outcome] += 1
                 applied += 1
-                last = kept_whole[kept - 1, T]
+                last = self.kept_whole[kept - 1, T]
                 safe = self.models[row.source] == IMU or self.stamps[T] - self.stamps[T_IMU] > self.imu_gap
                 if safe and self.stamps[T] - last >= self.snapshot_interval:
-                    memcpy(&kept_numbers[kept, 0], self.x, self.numbers_size * sizeof(double))
-                    memcpy(&kept_whole[kept, 0], self.stamps, whole.shape[0] * sizeof(int64_t))
-                    kept_applied[kept] = applied
+                    memcpy(&self.kept_numbers[kept, 0], self.x, self.numbers_size * sizeof(double))
+                    memcpy(&self.kept_whole[kept, 0], self.stamps, whole_size * sizeof(int64_t))
+                    self.kept_applied[kept] = applied
                     kept += 1
-        return applied, kept
+        return applied, kept, done
 
     cdef void step(self, Row* rows, Py_ssize_t index, Row* imu, Py_ssize_t whole_size) noexcept nogil:
         cdef Row* row = rows + index

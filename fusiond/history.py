@@ -25,6 +25,9 @@ from fusiond.state import NEVER, FilterState
 
 FIRST_ROWS = 4096
 FIRST_SNAPSHOTS = 64
+FORGET_EVERY = 256  # events
+OUTCOMES = tuple(Outcome)
+WAITING = int(Outcome.WAITING)
 
 
 class History:
@@ -42,6 +45,12 @@ class History:
         self._applied = 0  # rows of the live part that are in the head
         self._newest_imu_ns = self._newest_ns = NEVER
         self._snapshots = Snapshots(self.head)
+        self._attach()
+        self._until_forgetting = FORGET_EVERY
+
+    def _attach(self) -> None:
+        kept = self._snapshots
+        self.kernel.attach(self.head, self._table, self.counts, kept.numbers, kept.whole, kept.applied)
 
     @property
     def rows(self) -> Rows:
@@ -60,37 +69,32 @@ class History:
 
     def offer(self, measurement: Measurement, values: tuple[float, ...]) -> Outcome:
         """Put one event where it belongs in time and bring the head up to date. Returns its outcome, for now."""
+        kernel, t_ns, sequence = self.kernel, measurement.t_ns, measurement.sequence
         source = self.index[measurement.source]
-        t_ns = measurement.t_ns
         if t_ns < self.settled_ns:
             return self.count(source, Outcome.TOO_OLD)
-        place = self.kernel.place(self._table, self._begin, self._end, t_ns, source, measurement.sequence)
+        place = kernel.place(self._begin, self._end, t_ns, source, sequence)
         if place < 0:
             return self.count(source, Outcome.DUPLICATE)
         if self._end == len(self._table):
             self._make_room()
-        self.kernel.insert(
-            self._table,
-            self._begin + place,
-            self._end,
-            t_ns,
-            source,
-            measurement.sequence,
-            measurement.t_receive_ns,
-            Outcome.WAITING,
-            values,
-        )
+        at = self._begin + place
+        kernel.insert(at, self._end, t_ns, source, sequence, measurement.t_receive_ns, WAITING, values)
         self._end += 1
-        self.counts[source, Outcome.WAITING] += 1
+        if t_ns > self._newest_ns:
+            self._newest_ns = t_ns
+        if self.plan.models[source] == IMU and t_ns > self._newest_imu_ns:
+            self._newest_imu_ns = t_ns
+        first_changed = kernel.first_changed(self._begin, place)
         if place < self._applied:  # for the moment it counts among the applied: the rewind takes it out
             self._applied += 1
-        self._newest_ns = max(self._newest_ns, t_ns)
-        if self.plan.models[source] == IMU:
-            self._newest_imu_ns = max(self._newest_imu_ns, t_ns)
-        self._rewind(self.kernel.first_changed(self._table, self._begin, place))
+        if first_changed < self._applied:
+            self._rewind(first_changed)
         self._run()
-        outcome = Outcome(int(self._table["outcome"][self._begin + place]))
-        self._forget()
+        outcome = OUTCOMES[kernel.outcome(at)]
+        self._until_forgetting -= 1
+        if not self._until_forgetting:
+            self._forget()
         return outcome
 
     def count(self, source: int, outcome: Outcome) -> Outcome:
@@ -109,49 +113,42 @@ class History:
                 settled.copy_from(state)
         return settled
 
-    def _make_room(self) -> None:
-        """Move the live rows to the front of the table, or of a larger one if they fill half of it."""
-        live = self._end - self._begin
-        table = self._table if 2 * live < len(self._table) else np.zeros(4 * live, dtype=ROW)
-        table[:live] = self.rows
-        self._table, self._begin, self._end = table, 0, live
-
     def _rewind(self, first_changed: int) -> None:
-        """Restore the head from the newest snapshot at or before the first changed row, if that row was applied."""
-        if first_changed >= self._applied:
-            return
-        applied = self._snapshots.restore(self.head, first_changed)
+        """Restore the head from the newest snapshot that holds no changed row."""
+        kept = self._snapshots
+        kept.end = self.kernel.restore(kept.end, first_changed)
+        applied = int(kept.applied[kept.end - 1])
         self.rerun += self._applied - applied
         self._applied = applied
 
     def _run(self) -> None:
         """Apply the rows up to `applied_ns`."""
-        limit, kept = self.applied_ns, self._snapshots
-        while self._applied < self._end - self._begin and self._table["t_ns"][self._begin + self._applied] <= limit:
+        limit, kept, done = self.applied_ns, self._snapshots, False
+        while not done:
             before = self._applied
+            self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, limit, kept.end)
+            if done:
+                return
             if kept.end == len(kept.applied):
                 kept.make_room()
-            self._applied, kept.end = self.kernel.run(
-                self.head,
-                self._table,
-                self._begin,
-                self._end,
-                before,
-                limit,
-                self.counts,
-                kept.numbers,
-                kept.whole,
-                kept.applied,
-                kept.end,
-            )
-            if self._applied == before:  # not for the compiled loop: alignment, or a model written in Python
+                self._attach()
+            elif self._applied == before:
                 self._applied = run_one(self.head, self.rows, before, self.counts, self.plan)
-                kept.end = keep(
-                    self.head, self.rows, self._applied, self.plan, kept.numbers, kept.whole, kept.applied, kept.end
-                )
+                memory = (kept.numbers, kept.whole, kept.applied)
+                kept.end = keep(self.head, self.rows, self._applied, self.plan, memory, kept.end)
+
+    def _make_room(self) -> None:
+        """Move the live rows to the front of the table, or of a larger one if they fill half of it."""
+        self._forget()
+        live = self._end - self._begin
+        table = self._table if 2 * live < len(self._table) else np.zeros(4 * live, dtype=ROW)
+        table[:live] = self.rows
+        self._table, self._begin, self._end = table, 0, live
+        self._attach()
 
     def _forget(self) -> None:
-        """Drop the rows and snapshots that no event inside the horizon can need."""
+        """Drop the rows and snapshots that no event inside the horizon can need. When this is done changes no result."""
+        self._until_forgetting = FORGET_EVERY
         gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
         self._begin += gone
         self._applied -= gone
@@ -176,13 +173,6 @@ class Snapshots:
         state = self._empty.copy()
         state.numbers[:], state.whole[:] = self.numbers[self.begin], self.whole[self.begin]
         return int(self.applied[self.begin]), state
-
-    def restore(self, state: FilterState, first_changed: int) -> int:
-        """Drop the snapshots that hold a changed row, copy the newest other into `state`; returns its rows applied."""
-        while self.applied[self.end - 1] > first_changed:
-            self.end -= 1
-        state.numbers[:], state.whole[:] = self.numbers[self.end - 1], self.whole[self.end - 1]
-        return int(self.applied[self.end - 1])
 
     def make_room(self) -> None:
         """Move the snapshots to the front of the memory, or of a larger one if they fill half of it."""

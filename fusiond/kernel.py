@@ -84,48 +84,27 @@ ROW = np.dtype(
 Rows = NDArray[Any]  # structured, of dtype ROW
 
 
-def place(table: Rows, begin: int, end: int, t_ns: int, source: int, sequence: int) -> int:
-    """Where, counted from `begin`, an event goes among the rows begin..end; -1 if its very key is there already. Most
-    events are new, so the search begins at the end."""
-    i, key = end, (t_ns, source, sequence)
-    while i > begin:
-        row = table[i - 1]
-        before = int(row["t_ns"]), int(row["source"]), int(row["sequence"])
-        if before == key:
-            return -1
-        if before < key:
-            break
-        i -= 1
-    return i - begin
-
-
-def insert(
-    table: Rows,
-    at: int,
-    end: int,
-    t_ns: int,
-    source: int,
-    sequence: int,
-    t_receive_ns: int,
-    outcome: int,
-    values: tuple[float, ...],
-) -> None:
-    """Shift the rows at..end up by one and write an event into the gap."""
-    table[at + 1 : end + 1] = table[at:end]
-    row = np.zeros((), dtype=ROW)
-    row["t_ns"], row["source"], row["sequence"], row["t_receive_ns"] = t_ns, source, sequence, t_receive_ns
-    row["outcome"] = outcome
-    row["values"][: len(values)] = values
-    table[at] = row
-
-
 class Kernel:
-    """The operations of the hot loop for one plan. Stateless but for the plan."""
+    """The operations of the hot loop for one plan, on the memory that `attach` gives it. The history decides what to do
+    when; this does it."""
 
     def __init__(self, plan: Plan, size: int = ERROR_SIZE) -> None:
         self.plan = plan
-        self.place = place
-        self.insert = insert
+        self.size = size
+
+    def attach(
+        self,
+        head: FilterState,
+        table: Rows,
+        counts: NDArray[np.int64],
+        kept_numbers: Array,
+        kept_whole: NDArray[np.int64],
+        kept_applied: NDArray[np.int64],
+    ) -> None:
+        """Work on this memory from now on: the head state, the table of events, the counts (sources, outcomes), and the
+        snapshots: numbers, stamps and number of rows applied, one snapshot a row."""
+        self.head, self.table, self.counts = head, table, counts
+        self.kept_numbers, self.kept_whole, self.kept_applied = kept_numbers, kept_whole, kept_applied
 
     def propagate(self, state: FilterState, dt: float, force_b: Array, rate_b: Array) -> None:
         """One strapdown propagation over dt [s] (fusiond.strapdown.propagate)."""
@@ -134,10 +113,44 @@ class Kernel:
     def predict(self, state: FilterState, t_ns: int) -> None:
         predict(state, t_ns, self.plan)
 
-    def first_changed(self, table: Rows, begin: int, place: int) -> int:
+    def place(self, begin: int, end: int, t_ns: int, source: int, sequence: int) -> int:
+        """Where, counted from `begin`, an event goes among the rows begin..end; -1 if its very key is there already.
+        Most events are new, so the search begins at the end."""
+        i, key = end, (t_ns, source, sequence)
+        while i > begin:
+            row = self.table[i - 1]
+            before = int(row["t_ns"]), int(row["source"]), int(row["sequence"])
+            if before == key:
+                return -1
+            if before < key:
+                break
+            i -= 1
+        return i - begin
+
+    def insert(
+        self,
+        at: int,
+        end: int,
+        t_ns: int,
+        source: int,
+        sequence: int,
+        t_receive_ns: int,
+        outcome: int,
+        values: tuple[float, ...],
+    ) -> None:
+        """Shift the rows at..end up by one, write an event into the gap, and count its outcome."""
+        self.table[at + 1 : end + 1] = self.table[at:end]
+        row = np.zeros((), dtype=ROW)
+        row["t_ns"], row["source"], row["sequence"], row["t_receive_ns"] = t_ns, source, sequence, t_receive_ns
+        row["outcome"] = outcome
+        row["values"][: len(values)] = values
+        self.table[at] = row
+        self.counts[source, outcome] += 1
+
+    def first_changed(self, begin: int, place: int) -> int:
         """The first row whose result a new event at row `place` changes: itself, but for an IMU sample all that
         interpolate between it and the sample before it."""
-        models = self.plan.models
+        models, table = self.plan.models, self.table
         i = begin + place
         if models[table[i]["source"]] != IMU:
             return place
@@ -145,51 +158,53 @@ class Kernel:
             i -= 1
         return i - begin
 
-    def run(
-        self,
-        state: FilterState,
-        table: Rows,
-        begin: int,
-        end: int,
-        applied: int,
-        limit_ns: int,
-        counts: NDArray[np.int64],
-        kept_numbers: Array,
-        kept_whole: NDArray[np.int64],
-        kept_applied: NDArray[np.int64],
-        kept: int,
-    ) -> tuple[int, int]:
-        """Apply the rows from `applied` on (counted from `begin`) up to `limit_ns`, and keep snapshots in kept_*[kept:].
-        Stops when these are full. Returns the rows applied and the snapshots kept, as they are then."""
-        rows, plan = table[begin:end], self.plan
-        while applied < len(rows) and rows[applied]["t_ns"] <= limit_ns and kept < len(kept_applied):
-            applied = run_one(state, rows, applied, counts, plan)
-            kept = keep(state, rows, applied, plan, kept_numbers, kept_whole, kept_applied, kept)
-        return applied, kept
+    def outcome(self, at: int) -> int:
+        return int(self.table[at]["outcome"])
+
+    def restore(self, kept: int, first_changed: int) -> int:
+        """Copy into the head the newest of the snapshots ..kept that holds no changed row. Returns how many remain."""
+        while self.kept_applied[kept - 1] > first_changed:
+            kept -= 1
+        self.head.numbers[:], self.head.whole[:] = self.kept_numbers[kept - 1], self.kept_whole[kept - 1]
+        return kept
+
+    def run(self, begin: int, end: int, applied: int, limit_ns: int, kept: int) -> tuple[int, int, bool]:
+        """Apply to the head the rows from `applied` on (counted from `begin`) up to `limit_ns`, and keep snapshots.
+
+        Returns the rows applied, the snapshots kept, and whether it is done. If not, it wants memory for snapshots, or the
+        next row is one that only `run_one` can apply (the compiled kernel leaves alignment and models in Python to it).
+        """
+        rows, plan = self.table[begin:end], self.plan
+        while applied < len(rows) and rows[applied]["t_ns"] <= limit_ns:
+            if kept == len(self.kept_applied):
+                return applied, kept, False
+            applied = run_one(self.head, rows, applied, self.counts, plan)
+            kept = keep(self.head, rows, applied, plan, (self.kept_numbers, self.kept_whole, self.kept_applied), kept)
+        return applied, kept, True
+
+
+def keep(
+    head: FilterState,
+    rows: Rows,
+    applied: int,
+    plan: Plan,
+    memory: tuple[Array, NDArray[np.int64], NDArray[np.int64]],
+    kept: int,
+) -> int:
+    """Keep the head in row `kept` of `memory` if a snapshot is due after `applied` rows, and lasts. Returns the number
+    of snapshots kept."""
+    numbers, whole, counts = memory
+    due = head.stamps[T] - whole[kept - 1, T] >= plan.snapshot_interval_ns
+    if not due or not settles(head, int(rows[applied - 1]["source"]), plan):
+        return kept
+    numbers[kept], whole[kept], counts[kept] = head.numbers, head.whole, applied
+    return kept + 1
 
 
 def settles(state: FilterState, source: int, plan: Plan) -> bool:
     """Whether no IMU sample still to come can change the state after an event of `source`: it is an IMU sample itself, or
     the IMU has been silent for so long that the state coasts."""
     return plan.models[source] == IMU or bool(state.stamps[T] - state.stamps[T_IMU] > plan.imu_gap_ns)
-
-
-def keep(
-    state: FilterState,
-    rows: Rows,
-    applied: int,
-    plan: Plan,
-    kept_numbers: Array,
-    kept_whole: NDArray[np.int64],
-    kept_applied: NDArray[np.int64],
-    kept: int,
-) -> int:
-    """Keep a snapshot in kept_*[kept] if one is due after `applied` rows, and lasts. Returns the snapshots kept."""
-    due = state.stamps[T] - kept_whole[kept - 1, T] >= plan.snapshot_interval_ns
-    if not due or not settles(state, int(rows[applied - 1]["source"]), plan):
-        return kept
-    kept_numbers[kept], kept_whole[kept], kept_applied[kept] = state.numbers, state.whole, applied
-    return kept + 1
 
 
 def run_one(state: FilterState, rows: Rows, index: int, counts: NDArray[np.int64], plan: Plan) -> int:
