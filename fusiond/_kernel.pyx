@@ -16,7 +16,7 @@ from fusiond.kernel import Outcome
 from fusiond.observe import wheel_speed
 
 cdef enum:
-    MOST = 32  # error states at most
+    n = 18  # error states
     VALUES = 8
     PARAMETERS = 12
 
@@ -30,6 +30,12 @@ cdef struct Row:
     double values[VALUES]
     double innovation[3]
     double variance[3]
+
+cdef extern from *:
+    """
+    typedef double *__restrict__ vector;  /* n numbers that nothing else points to: lets the loops use vector units */
+    """
+    ctypedef double* vector
 
 cdef struct Noise:
     double accel, gyro, accel_bias, gyro_bias, scale, mount
@@ -308,7 +314,7 @@ cdef void mat_ne(double* r, double* m) noexcept nogil:
 
 # ---------------------------------------------------------------- propagation (fusiond.strapdown)
 
-cdef void add_noise(double* p, int n, double dt, double accel, double gyro, Noise* noise) noexcept nogil:
+cdef void add_noise(double* p, double dt, double accel, double gyro, Noise* noise) noexcept nogil:
     cdef int i
     cdef double cubic = accel * dt * dt / 3 * dt, square = accel * dt * dt / 2
     for i in range(3):
@@ -324,13 +330,13 @@ cdef void add_noise(double* p, int n, double dt, double accel, double gyro, Nois
         p[(MOUNT_ERROR + i) * (n + 1)] += noise.mount * dt
 
 
-cdef inline void axpy(double* to, double factor, double* row, int n) noexcept nogil:
+cdef inline void axpy(vector to, double factor, vector row) noexcept nogil:
     cdef int j
     for j in range(n):
         to[j] += factor * row[j]
 
 
-cdef void propagate_step(double* x, double* p, int n, double dt, double* force_b, double* rate_b,
+cdef void propagate_step(double* x, double* p, double dt, double* force_b, double* rate_b,
                          Noise* noise) noexcept nogil:
     cdef double force[3]
     cdef double turn[3]
@@ -347,11 +353,8 @@ cdef void propagate_step(double* x, double* p, int n, double dt, double* force_b
     cdef double there[3]
     cdef double change[3]
     cdef double grad[9]
-    cdef double phi[9][15]  # rows of the transition matrix for position, velocity, attitude
-    cdef double top[9 * MOST]
-    cdef double corner[9][9]
-    cdef double r2, strength, total, dt2 = dt * dt / 2
-    cdef int i, j, k
+    cdef double r2, strength
+    cdef int i, j
     for i in range(3):
         force[i] = force_b[i] - x[ACCEL_BIAS_B + i]
         turn[i] = (rate_b[i] - x[GYRO_BIAS_B + i]) * dt
@@ -394,60 +397,74 @@ cdef void propagate_step(double* x, double* p, int n, double dt, double* force_b
     normalise(q3)
     memcpy(x + QUATERNION_EB, q3, 4 * sizeof(double))
 
-    # transition: columns POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS; the rest is identity
-    memset(phi, 0, sizeof(phi))
-    cdef double skew[9]
-    skew[0] = 0.0
-    skew[1] = -f[2]
-    skew[2] = f[1]
-    skew[3] = f[2]
-    skew[4] = 0.0
-    skew[5] = -f[0]
-    skew[6] = -f[1]
-    skew[7] = f[0]
-    skew[8] = 0.0
-    for i in range(3):
-        phi[i][i] = 1.0
-        phi[i][VELOCITY + i] = dt
-        phi[3 + i][VELOCITY + i] = 1.0
-        phi[6 + i][ATTITUDE + i] = 1.0
-        for j in range(3):
-            phi[i][ATTITUDE + j] = skew[3 * i + j] * -dt2
-            phi[i][ACCEL_BIAS + j] = c[3 * i + j] * -dt2
-            phi[3 + i][POSITION + j] = grad[3 * i + j] * dt
-            phi[3 + i][ATTITUDE + j] = skew[3 * i + j] * -dt
-            phi[3 + i][GYRO_BIAS + j] = (
-                skew[3 * i] * c[j] + skew[3 * i + 1] * c[3 + j] + skew[3 * i + 2] * c[6 + j]) * dt2
-            phi[3 + i][ACCEL_BIAS + j] = c[3 * i + j] * -dt
-            phi[6 + i][GYRO_BIAS + j] = c[3 * i + j] * -dt
-    phi[3][VELOCITY + 1] += EARTH_RATE * (2 * dt)
-    phi[4][VELOCITY + 0] -= EARTH_RATE * (2 * dt)
-    phi[6][ATTITUDE + 1] += EARTH_RATE * dt
-    phi[7][ATTITUDE + 0] -= EARTH_RATE * dt
+    grow(p, dt, f, c, grad)
+    add_noise(p, dt, noise.accel, noise.gyro, noise)
 
-    # P' = Phi P Phi': only the first nine rows change, and of the second factor only their own columns count
+
+cdef void carry(double* out, double* row, double dt, double* f, double* c, double* grad) noexcept nogil:
+    """Phi times one column: the nine numbers of position, velocity, attitude, from a column of n (given as a row)."""
+    cdef double u[3]
+    cdef double g[3]
+    cdef double dt2 = dt * dt / 2, turn = EARTH_RATE * dt
+    cdef int i
+    for i in range(3):
+        g[i] = c[3 * i] * row[GYRO_BIAS] + c[3 * i + 1] * row[GYRO_BIAS + 1] + c[3 * i + 2] * row[GYRO_BIAS + 2]
+        u[i] = c[3 * i] * row[ACCEL_BIAS] + c[3 * i + 1] * row[ACCEL_BIAS + 1] + c[3 * i + 2] * row[ACCEL_BIAS + 2]
+    u[0] += f[1] * row[ATTITUDE + 2] - f[2] * row[ATTITUDE + 1]
+    u[1] += f[2] * row[ATTITUDE] - f[0] * row[ATTITUDE + 2]
+    u[2] += f[0] * row[ATTITUDE + 1] - f[1] * row[ATTITUDE]
+    for i in range(3):
+        out[i] = row[i] + dt * row[VELOCITY + i] - dt2 * u[i]
+        out[3 + i] = row[VELOCITY + i] - dt * u[i] + dt * (
+            grad[3 * i] * row[0] + grad[3 * i + 1] * row[1] + grad[3 * i + 2] * row[2])
+        out[6 + i] = row[ATTITUDE + i] - dt * g[i]
+    out[3] += dt2 * (f[1] * g[2] - f[2] * g[1]) + 2 * turn * row[VELOCITY + 1]
+    out[4] += dt2 * (f[2] * g[0] - f[0] * g[2]) - 2 * turn * row[VELOCITY]
+    out[5] += dt2 * (f[0] * g[1] - f[1] * g[0])
+    out[6] += turn * row[ATTITUDE + 1]
+    out[7] -= turn * row[ATTITUDE]
+
+
+cdef void grow(double* p, double dt, double* f, double* c, double* grad) noexcept nogil:
+    """P = Phi P Phi'. Only the rows and columns of position, velocity and attitude change, and of these only the corner
+    where they meet needs both factors. The rows are written out so that the compiler can use vector units."""
+    cdef double top[9 * n]
+    cdef double u[3 * n]
+    cdef double g[3 * n]
+    cdef double done[9]
+    cdef double dt2 = dt * dt / 2, turn = EARTH_RATE * dt
+    cdef int i, j, k
+    for i in range(3):
+        for j in range(n):
+            g[i * n + j] = (c[3 * i] * p[9 * n + j] + c[3 * i + 1] * p[10 * n + j] + c[3 * i + 2] * p[11 * n + j])
+            u[i * n + j] = (c[3 * i] * p[12 * n + j] + c[3 * i + 1] * p[13 * n + j] + c[3 * i + 2] * p[14 * n + j])
+    for j in range(n):
+        u[j] += f[1] * p[8 * n + j] - f[2] * p[7 * n + j]
+        u[n + j] += f[2] * p[6 * n + j] - f[0] * p[8 * n + j]
+        u[2 * n + j] += f[0] * p[7 * n + j] - f[1] * p[6 * n + j]
+    for i in range(3):
+        for j in range(n):
+            top[i * n + j] = p[i * n + j] + dt * p[(3 + i) * n + j] - dt2 * u[i * n + j]
+            top[(3 + i) * n + j] = p[(3 + i) * n + j] - dt * u[i * n + j] + dt * (
+                grad[3 * i] * p[j] + grad[3 * i + 1] * p[n + j] + grad[3 * i + 2] * p[2 * n + j])
+            top[(6 + i) * n + j] = p[(6 + i) * n + j] - dt * g[i * n + j]
+    for j in range(n):
+        top[3 * n + j] += dt2 * (f[1] * g[2 * n + j] - f[2] * g[n + j]) + 2 * turn * p[4 * n + j]
+        top[4 * n + j] += dt2 * (f[2] * g[j] - f[0] * g[2 * n + j]) - 2 * turn * p[3 * n + j]
+        top[5 * n + j] += dt2 * (f[0] * g[n + j] - f[1] * g[j])
+        top[6 * n + j] += turn * p[7 * n + j]
+        top[7 * n + j] -= turn * p[6 * n + j]
     for i in range(9):
-        memset(top + i * n, 0, n * sizeof(double))
-        for k in range(15):
-            if phi[i][k] != 0.0:
-                axpy(top + i * n, phi[i][k], p + k * n, n)
-    for i in range(9):
+        carry(done, top + i * n, dt, f, c, grad)
         for j in range(i, 9):
-            total = 0.0
-            for k in range(15):
-                total += top[i * n + k] * phi[j][k]
-            corner[i][j] = total
-    for i in range(9):
-        for j in range(i, 9):
-            p[i * n + j] = corner[i][j]
-            p[j * n + i] = corner[i][j]
+            p[i * n + j] = done[j]
+            p[j * n + i] = done[j]
         for j in range(9, n):
             p[i * n + j] = top[i * n + j]
             p[j * n + i] = top[i * n + j]
-    add_noise(p, n, dt, noise.accel, noise.gyro, noise)
 
 
-cdef void propagate(double* x, double* p, int n, double dt, double* force_b, double* rate_b,
+cdef void propagate(double* x, double* p, double dt, double* force_b, double* rate_b,
                     Noise* noise) noexcept nogil:
     cdef int parts = <int>(dt / LONGEST_STEP), i
     if parts * LONGEST_STEP < dt:
@@ -455,30 +472,28 @@ cdef void propagate(double* x, double* p, int n, double dt, double* force_b, dou
     if parts < 1:
         parts = 1
     for i in range(parts):
-        propagate_step(x, p, n, dt / parts, force_b, rate_b, noise)
+        propagate_step(x, p, dt / parts, force_b, rate_b, noise)
 
 
-cdef void coast(double* x, double* p, int n, double dt, Noise* noise) noexcept nogil:
+cdef void coast(double* x, double* p, double dt, Noise* noise) noexcept nogil:
     cdef int i, j
     for i in range(3):
         x[POSITION_E + i] += x[VELOCITY_E + i] * dt
     for i in range(3):
-        axpy(p + i * n, dt, p + (VELOCITY + i) * n, n)
+        axpy(p + i * n, dt, p + (VELOCITY + i) * n)
     for i in range(n):
         for j in range(3):
             p[i * n + j] += dt * p[i * n + VELOCITY + j]
-    mirror(p, n)
-    add_noise(p, n, dt, COAST_ACCEL2, COAST_RATE2, noise)
+    mirror(p)
+    add_noise(p, dt, COAST_ACCEL2, COAST_RATE2, noise)
 
 
-cdef void mirror(double* p, int n) noexcept nogil:
+cdef void mirror(double* p) noexcept nogil:
+    """The upper triangle decides."""
     cdef int i, j
-    cdef double mean
     for i in range(n):
         for j in range(i + 1, n):
-            mean = (p[i * n + j] + p[j * n + i]) / 2
-            p[i * n + j] = mean
-            p[j * n + i] = mean
+            p[j * n + i] = p[i * n + j]
 
 
 # ---------------------------------------------------------------- observation models (fusiond.observe)
@@ -486,11 +501,11 @@ cdef void mirror(double* p, int n) noexcept nogil:
 cdef struct Observation:
     int m
     double innovation[3]
-    double jacobian[3 * MOST]
+    double jacobian[3 * n]
     double variance[3]
 
 
-cdef void skew_rows(double* to_n, double* v, double sign, double* jacobian, int n, int m, int column) noexcept nogil:
+cdef void skew_rows(double* to_n, double* v, double sign, double* jacobian, int m, int column) noexcept nogil:
     """jacobian[:m, column:column+3] = sign * to_n @ skew(v)"""
     cdef int i
     cdef double* a
@@ -501,7 +516,7 @@ cdef void skew_rows(double* to_n, double* v, double sign, double* jacobian, int 
         jacobian[i * n + column + 2] = sign * (a[0] * v[1] - a[1] * v[0])
 
 
-cdef void gnss_position(double* x, double* row, double* parameter, int n, Observation* seen) noexcept nogil:
+cdef void gnss_position(double* x, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double to_n[9]
     cdef double c[9]
     cdef double lever[3]
@@ -516,14 +531,14 @@ cdef void gnss_position(double* x, double* row, double* parameter, int n, Observ
         off[i] = row[i] - x[POSITION_E + i] - lever[i]
         for j in range(3):
             seen.jacobian[i * n + POSITION + j] = to_n[3 * i + j]
-    skew_rows(to_n, lever, -1.0, seen.jacobian, n, 3, ATTITUDE)
+    skew_rows(to_n, lever, -1.0, seen.jacobian, 3, ATTITUDE)
     times(to_n, off, seen.innovation)
     seen.variance[0] = row[3]
     seen.variance[1] = row[3]
     seen.variance[2] = row[4]
 
 
-cdef void gnss_velocity(double* x, double* auxiliary, double* row, double* parameter, int n,
+cdef void gnss_velocity(double* x, double* auxiliary, double* row, double* parameter,
                         Observation* seen) noexcept nogil:
     cdef double to_n[9]
     cdef double c[9]
@@ -546,8 +561,8 @@ cdef void gnss_velocity(double* x, double* auxiliary, double* row, double* param
         for j in range(3):
             seen.jacobian[i * n + VELOCITY + j] = to_n[3 * i + j]
             turned[3 * i + j] = to_n[3 * i] * c[j] + to_n[3 * i + 1] * c[3 + j] + to_n[3 * i + 2] * c[6 + j]
-    skew_rows(to_n, swing, -1.0, seen.jacobian, n, m, ATTITUDE)
-    skew_rows(turned, parameter, 1.0, seen.jacobian, n, m, GYRO_BIAS)
+    skew_rows(to_n, swing, -1.0, seen.jacobian, m, ATTITUDE)
+    skew_rows(turned, parameter, 1.0, seen.jacobian, m, GYRO_BIAS)
     for i in range(3):
         v[i] = x[VELOCITY_E + i] + swing[i]
     times(to_n, v, h)
@@ -556,7 +571,7 @@ cdef void gnss_velocity(double* x, double* auxiliary, double* row, double* param
         seen.variance[i] = row[3]
 
 
-cdef void point_velocity(double* x, double* auxiliary, double* point, int n, int first, int last, double* velocity,
+cdef void point_velocity(double* x, double* auxiliary, double* point, int first, int last, double* velocity,
                          double* jacobian) noexcept nogil:
     """Velocity (3,) in vehicle axes of a point, and rows first..last of its derivative, n wide each."""
     cdef double c[9]
@@ -592,8 +607,8 @@ cdef void point_velocity(double* x, double* auxiliary, double* point, int n, int
             # rotation_vb @ rotation_eb.T
             turned[3 * i + j] = r[3 * i] * c[3 * j] + r[3 * i + 1] * c[3 * j + 1] + r[3 * i + 2] * c[3 * j + 2]
             jacobian[i * n + VELOCITY + j] = turned[3 * i + j]
-    skew_rows(turned + 3 * first, x + VELOCITY_E, 1.0, jacobian + first * n, n, last - first, ATTITUDE)
-    skew_rows(r + 3 * first, point, 1.0, jacobian + first * n, n, last - first, GYRO_BIAS)
+    skew_rows(turned + 3 * first, x + VELOCITY_E, 1.0, jacobian + first * n, last - first, ATTITUDE)
+    skew_rows(r + 3 * first, point, 1.0, jacobian + first * n, last - first, GYRO_BIAS)
     cdef double by[6]
     by[0] = -cy * sp * vb[0] + cy * cp * vb[2]
     by[1] = -sy * cp * vb[0] - cy * vb[1] - sy * sp * vb[2]
@@ -606,12 +621,12 @@ cdef void point_velocity(double* x, double* auxiliary, double* point, int n, int
             jacobian[i * n + MOUNT_ERROR + k] = by[2 * i + k]
 
 
-cdef void wheel(double* x, double* auxiliary, double* row, double* parameter, int n, Observation* seen) noexcept nogil:
+cdef void wheel(double* x, double* auxiliary, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double v[3]
-    cdef double by[3 * MOST]
+    cdef double by[3 * n]
     cdef double speed, track, along, across = 0.0, scale = 1 + x[WHEEL_SCALE], reading = row[0]
     cdef int j, rows = 2 if parameter[4] != 0.0 else 1
-    point_velocity(x, auxiliary, parameter, n, 0, rows, v, by)
+    point_velocity(x, auxiliary, parameter, 0, rows, v, by)
     speed = v[0]
     along = 1.0
     track = sqrt(v[0] * v[0] + v[1] * v[1])
@@ -634,15 +649,15 @@ cdef void wheel(double* x, double* auxiliary, double* row, double* parameter, in
 
 # ---------------------------------------------------------------- update (fusiond.update)
 
-cdef double update(double* x, double* p, int n, Observation* seen, double gate, double* spread_diagonal) noexcept nogil:
+cdef double update(double* x, double* p, Observation* seen, double gate, double* spread_diagonal) noexcept nogil:
     """Fuse unless the test ratio exceeds 1; returns the ratio. Infinite: S is not positive definite or not finite."""
-    cdef double across[3][MOST]
-    cdef double gain[3][MOST]
-    cdef double kept[3][MOST]
+    cdef double across[3][n]
+    cdef double gain[3][n]
+    cdef double kept[3][n]
     cdef double s[3][3]
     cdef double low[3][3]
     cdef double solved[3]
-    cdef double error[MOST]
+    cdef double error[n]
     cdef double part[4]
     cdef double turned[4]
     cdef double ratio = 0.0, rest, h
@@ -652,7 +667,7 @@ cdef double update(double* x, double* p, int n, Observation* seen, double gate, 
         for k in range(n):
             h = seen.jacobian[a * n + k]
             if h != 0.0:
-                axpy(across[a], h, p + k * n, n)
+                axpy(across[a], h, p + k * n)
     for a in range(m):
         for i in range(a + 1):
             rest = 0.0
@@ -688,32 +703,34 @@ cdef double update(double* x, double* p, int n, Observation* seen, double gate, 
         for j in range(n):
             gain[i][j] = across[i][j]
         for k in range(i):
-            axpy(gain[i], -low[i][k], gain[k], n)
+            axpy(gain[i], -low[i][k], gain[k])
         for j in range(n):
             gain[i][j] = gain[i][j] / low[i][i]
     for i in range(m - 1, -1, -1):
         for k in range(i + 1, m):
-            axpy(gain[i], -low[k][i], gain[k], n)
+            axpy(gain[i], -low[k][i], gain[k])
         for j in range(n):
             gain[i][j] = gain[i][j] / low[i][i]
-    # Joseph: A = P - K (H P); P = A - (A H') K' + K R K'
+    # Joseph: with A = P - K (H P), P = A - (A H') K' + K R K'; all by rows, so A' is what is kept for the while
+    for k in range(n):
+        for a in range(m):
+            axpy(p + k * n, -across[a][k], gain[a])
     for a in range(m):
-        for i in range(n):
-            axpy(p + i * n, -gain[a][i], across[a], n)
+        memset(kept[a], 0, n * sizeof(double))
+        for k in range(n):
+            h = seen.jacobian[a * n + k]
+            if h != 0.0:
+                axpy(kept[a], -h, p + k * n)
     for a in range(m):
-        for i in range(n):
-            rest = 0.0
-            for k in range(n):
-                rest += p[i * n + k] * seen.jacobian[a * n + k]
-            kept[a][i] = seen.variance[a] * gain[a][i] - rest
-    for a in range(m):
-        for i in range(n):
-            axpy(p + i * n, kept[a][i], gain[a], n)
-    mirror(p, n)
+        axpy(kept[a], seen.variance[a], gain[a])
+    for k in range(n):
+        for a in range(m):
+            axpy(p + k * n, gain[a][k], kept[a])
+    mirror(p)
     for j in range(n):
         error[j] = 0.0
     for a in range(m):
-        axpy(error, seen.innovation[a], gain[a], n)
+        axpy(error, seen.innovation[a], gain[a])
     for i in range(3):
         x[POSITION_E + i] += error[POSITION + i]
         x[VELOCITY_E + i] += error[VELOCITY + i]
@@ -734,7 +751,7 @@ cdef double update(double* x, double* p, int n, Observation* seen, double gate, 
 cdef class Kernel:
     """The compiled counterpart of fusiond.kernel.Kernel, for one plan."""
 
-    cdef int n, sources
+    cdef int sources
     cdef int32_t[::1] models
     cdef double[:, ::1] parameters
     cdef double[:, ::1] constraints
@@ -761,9 +778,8 @@ cdef class Kernel:
     def __init__(self, plan, int size):
         import numpy as np
         check_layout()
-        if size > MOST:
-            raise ValueError(f"at most {MOST} error states, not {size}")
-        self.n = size
+        if size != n:
+            raise ValueError(f"compiled for {n} error states, not {size}")
         self.sources = len(plan.sources)
         self.models = np.array(plan.models, dtype=np.int32)
         self.parameters = np.ascontiguousarray(plan.parameters)
@@ -783,7 +799,7 @@ cdef class Kernel:
         self.still_wheel = plan.motion.still_wheel_mps
         self.still_gyro2 = plan.still_gyro ** 2
         self.still_accel2 = plan.motion.still_accel_mps2 ** 2
-        self.numbers_size = NOMINAL_SIZE + size * size + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
+        self.numbers_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
 
     cdef int bind(self, double[::1] numbers, int64_t[::1] whole) except -1:
         if numbers.shape[0] != self.numbers_size:
@@ -792,7 +808,7 @@ cdef class Kernel:
             raise ValueError("a state of other sources")
         self.x = &numbers[0]
         self.p = self.x + NOMINAL_SIZE
-        self.auxiliary = self.p + self.n * self.n
+        self.auxiliary = self.p + n * n
         self.memory = self.auxiliary + AUXILIARY_SIZE
         self.stamps = &whole[0]
         self.source_stamps = self.stamps + STAMPS_SIZE
@@ -801,7 +817,7 @@ cdef class Kernel:
     def propagate(self, state, double dt, double[::1] force_b, double[::1] rate_b):
         """fusiond.strapdown.propagate"""
         self.bind(state.numbers, state.whole)
-        propagate(self.x, self.p, self.n, dt, &force_b[0], &rate_b[0], &self.noise)
+        propagate(self.x, self.p, dt, &force_b[0], &rate_b[0], &self.noise)
 
     def predict(self, state, int64_t t_ns):
         """fusiond.kernel.predict"""
@@ -815,10 +831,10 @@ cdef class Kernel:
         if carried < begin:
             carried = begin
         if carried > begin:
-            propagate(self.x, self.p, self.n, (carried - begin) * 1e-9, self.auxiliary + HELD_FORCE_B,
+            propagate(self.x, self.p, (carried - begin) * 1e-9, self.auxiliary + HELD_FORCE_B,
                       self.auxiliary + HELD_RATE_B, &self.noise)
         if t_ns > carried:
-            coast(self.x, self.p, self.n, (t_ns - carried) * 1e-9, &self.noise)
+            coast(self.x, self.p, (t_ns - carried) * 1e-9, &self.noise)
         self.stamps[T] = t_ns
 
     def attach(self, head, Row[::1] table, int64_t[:, ::1] counts, double[:, ::1] kept_numbers,
@@ -949,8 +965,8 @@ cdef class Kernel:
         cdef Py_ssize_t i
         for i in range(NOMINAL_SIZE):
             total += self.x[i]
-        for i in range(self.n):
-            total += self.p[i * (self.n + 1)]
+        for i in range(n):
+            total += self.p[i * (n + 1)]
         if isfinite(total):
             return
         resets = self.stamps[RESETS]
@@ -976,7 +992,7 @@ cdef class Kernel:
         dt = (t_ns - begin) * 1e-9
         self.stamps[T] = t_ns
         if imu == NULL or held == NEVER or imu.t_ns - held > self.imu_gap:
-            coast(self.x, self.p, self.n, dt, &self.noise)
+            coast(self.x, self.p, dt, &self.noise)
             return
         span = <double>(imu.t_ns - held)
         middle = <double>((begin - held) + (t_ns - held)) / 2 / span
@@ -988,7 +1004,7 @@ cdef class Kernel:
             change = imu.values[3 + i] - a[HELD_RATE_B + i]
             rate[i] = a[HELD_RATE_B + i] + middle * change
             a[RATE_B + i] = a[HELD_RATE_B + i] + end * change
-        propagate(self.x, self.p, self.n, dt, force, rate, &self.noise)
+        propagate(self.x, self.p, dt, force, rate, &self.noise)
 
     cdef void hold(self, Row* row) noexcept nogil:
         cdef double* a = self.auxiliary
@@ -1045,11 +1061,11 @@ cdef class Kernel:
         cdef int64_t now = self.stamps[T]
         cdef Observation seen
         cdef double v[3]
-        cdef double by[3 * MOST]
+        cdef double by[3 * n]
         cdef double c[9]
         cdef double earth[3]
         cdef double* parameter
-        cdef int i, j, n = self.n
+        cdef int i, j
         if now - self.stamps[T_CONSTRAINT] < self.constraint_interval:
             return
         self.stamps[T_CONSTRAINT] = now
@@ -1074,7 +1090,7 @@ cdef class Kernel:
             self.apply(2, &seen)
         elif self.non_holonomic:
             parameter = &self.constraints[0, 0]
-            point_velocity(self.x, self.auxiliary, parameter, n, 1, 3, v, by)
+            point_velocity(self.x, self.auxiliary, parameter, 1, 3, v, by)
             if fabs(v[0]) < parameter[5]:
                 return
             seen.m = 2
@@ -1085,7 +1101,7 @@ cdef class Kernel:
             self.apply(0, &seen)
 
     cdef void apply(self, int which, Observation* seen) noexcept nogil:
-        cdef double ratio = update(self.x, self.p, self.n, seen, self.gates[seen.m], NULL)
+        cdef double ratio = update(self.x, self.p, seen, self.gates[seen.m], NULL)
         self.auxiliary[CONSTRAINT_RATIO + which] = ratio
         self.stamps[(CONSTRAINT_FUSED if ratio <= 1 else CONSTRAINT_REJECTED) + which] += 1
 
@@ -1098,11 +1114,11 @@ cdef class Kernel:
         cdef double factor = 1.0, interval, alike, ratio
         if model == WHEEL_SPEED:
             memory[LAST_VALUE] = row.values[0]
-            wheel(self.x, self.auxiliary, row.values, parameter, self.n, &seen)
+            wheel(self.x, self.auxiliary, row.values, parameter, &seen)
         elif model == GNSS_POSITION:
-            gnss_position(self.x, row.values, parameter, self.n, &seen)
+            gnss_position(self.x, row.values, parameter, &seen)
         else:
-            gnss_velocity(self.x, self.auxiliary, row.values, parameter, self.n, &seen)
+            gnss_velocity(self.x, self.auxiliary, row.values, parameter, &seen)
         if parameter[3] > 0 and stamps[T_FUSED] != NEVER:
             interval = (row.t_ns - stamps[T_FUSED]) * 1e-9
             if interval < 1e-6:
@@ -1115,7 +1131,7 @@ cdef class Kernel:
         for a in range(seen.m):
             seen.variance[a] = seen.variance[a] * factor
             row.innovation[a] = seen.innovation[a]
-        ratio = update(self.x, self.p, self.n, &seen, self.gates[seen.m], row.variance)
+        ratio = update(self.x, self.p, &seen, self.gates[seen.m], row.variance)
         row.ratio = ratio
         memory[LAST_RATIO] = ratio
         if not ratio <= 1 and model != WHEEL_SPEED and stamps[T_REJECTED] != NEVER \
@@ -1137,7 +1153,7 @@ cdef class Kernel:
         cdef double spread[9]
         cdef double half[9]
         cdef double* p = self.p
-        cdef int i, j, k, n = self.n, m = seen.m
+        cdef int i, j, k, m = seen.m
         mat_ne(self.x, to_n)
         for i in range(3):
             for j in range(3):
