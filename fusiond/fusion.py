@@ -1,4 +1,4 @@
-"""Fusion: events in, outcomes and estimates out. The one door to the core; live and replay differ only in who calls it."""
+"""Fusion: events in, outcomes and estimates out. The one door to the core; live and replay differ in who calls it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.clock import Clock
-from fusiond.config import Config, Imu
+from fusiond.config import Config
 from fusiond.earth import Array, geodetic, mat_ne
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.history import History
 from fusiond.kernel import Outcome
-from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Received, WheelSpeed
+from fusiond.measurements import GnssPosition, ImuSample, Invalid, Measurement, Received, WheelSpeed
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
 from fusiond.plan import SECOND, nanoseconds, plan
 from fusiond.rotation import matrix, quaternion
@@ -113,25 +113,26 @@ class Fusion:
 
     def _values(self, measurement: Measurement) -> tuple[float, ...]:
         """A payload as a row of numbers. Raises _Unusable."""
-        payload, name = measurement.payload, measurement.source.partition(".")[0]
+        payload = measurement.payload
         if isinstance(payload, Invalid):
             raise _Unusable(payload.reason)
         values: tuple[float, ...]
-        if isinstance(payload, ImuSample):
-            values = (*payload.specific_force_b, *payload.angular_rate_b)
-            _finite(values)
-            _within(values, self.config.imu[name])
+        if isinstance(payload, WheelSpeed):
+            values = wheel_speed.values(payload, self.config.wheel[measurement.source])
+            _within(values[:1], SPEED_LIMIT, "impossible speed")
+        elif isinstance(payload, ImuSample):
+            imu = self.config.imu[measurement.source]
+            _within(payload.specific_force_b, imu.accel_limit, "beyond the accelerometer's range")
+            _within(payload.angular_rate_b, imu.gyro_limit, "beyond the gyro's range")
+            values = payload.specific_force_b + payload.angular_rate_b
         elif isinstance(payload, GnssPosition):
-            _finite((payload.latitude, payload.longitude, payload.height))
             _on_earth(payload)
-            values = gnss_position.values(payload, self.config.gnss[name])
-        elif isinstance(payload, GnssVelocity):
-            values = gnss_velocity.values(payload, self.config.gnss[name])
-        elif isinstance(payload, WheelSpeed):
-            values = wheel_speed.values(payload, self.config.wheel[name])
-        _finite(values)
-        if isinstance(payload, GnssVelocity | WheelSpeed) and max(abs(v) for v in values[:3]) > SPEED_LIMIT:
-            raise _Unusable("impossible speed")
+            values = gnss_position.values(payload, self.config.gnss[measurement.source.partition(".")[0]])
+        else:
+            values = gnss_velocity.values(payload, self.config.gnss[measurement.source.partition(".")[0]])
+            _within(values[:3], SPEED_LIMIT, "impossible speed")
+        if not math.isfinite(sum(values)):
+            raise _Unusable("not finite")
         return values
 
     def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
@@ -153,20 +154,19 @@ class _Unusable(Exception):
     """A payload that must not reach the filter; the message is the reason."""
 
 
-def _finite(values: tuple[float, ...]) -> None:
-    if not all(math.isfinite(value) for value in values):
-        raise _Unusable("not finite")
-
-
-def _within(values: tuple[float, ...], imu: Imu) -> None:
-    if max(abs(v) for v in values[:3]) > imu.accel_limit or max(abs(v) for v in values[3:]) > imu.gyro_limit:
-        raise _Unusable("beyond the sensor's range")
+def _within(values: tuple[float, ...], limit: float, complaint: str) -> None:
+    """Every value finite and at most `limit` in size."""
+    for value in values:
+        if not -limit <= value <= limit:
+            raise _Unusable(complaint if math.isfinite(value) else "not finite")
 
 
 def _on_earth(fix: GnssPosition) -> None:
     low, high = HEIGHT_LIMITS
-    if abs(fix.latitude) > math.pi / 2 or abs(fix.longitude) > 2 * math.pi or not low <= fix.height <= high:
-        raise _Unusable("impossible position")
+    _within((fix.latitude,), math.pi / 2, "impossible position")
+    _within((fix.longitude,), 2 * math.pi, "impossible position")
+    if not low <= fix.height <= high:
+        raise _Unusable("impossible position" if math.isfinite(fix.height) else "not finite")
 
 
 def state_estimate(state: FilterState) -> StateEstimate:
