@@ -73,11 +73,11 @@ class History:
         source = self.index[measurement.source]
         if t_ns < self.settled_ns:
             return self.count(source, Outcome.TOO_OLD)
+        if self._end == len(self._table):
+            self._make_room()
         place = kernel.place(self._begin, self._end, t_ns, source, sequence)
         if place < 0:
             return self.count(source, Outcome.DUPLICATE)
-        if self._end == len(self._table):
-            self._make_room()
         at = self._begin + place
         kernel.insert(at, self._end, t_ns, source, sequence, measurement.t_receive_ns, WAITING, values)
         self._end += 1

@@ -1,0 +1,117 @@
+"""The simulated GNSS receiver: noise, smoothed velocity, outages, jumps, a spoofer, a frozen fix; wire units out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.earth import Array
+from fusiond.simulation.scenario import Gnss, Scenario
+from fusiond.simulation.trajectory import Trajectory, turned
+from fusiond.simulation.transport import Mask, within
+from fusiond.simulation.wgs84 import shifted, wrapped
+
+Integers = NDArray[np.int64]
+LAG_POINTS = 8  # instants over which the smoothed velocity is a mean
+FIX_3D, FIX_NONE = 3, 1  # GPS_FIX_TYPE
+UNKNOWN_16 = 65535
+
+
+@dataclass(frozen=True, slots=True)
+class Fixes:
+    """N fixes in the units of GPS_RAW_INT; h_acc, v_acc [mm] and vel_acc [mm/s] are the same for all."""
+
+    fix_type: Integers
+    lat: Integers  # 1e-7 deg
+    lon: Integers  # 1e-7 deg
+    alt: Integers  # mm above mean sea level
+    alt_ellipsoid: Integers  # mm
+    vel: Integers  # cm/s
+    cog: Integers  # 1e-2 deg
+    h_acc: int
+    v_acc: int
+    vel_acc: int
+
+
+def antenna(trajectory: Trajectory, gnss: Gnss, t: Array) -> tuple[tuple[Array, Array, Array], Array]:
+    """True position [rad, rad, m] and velocity (N, 3) [m/s] of the antenna at the times `t` [s]."""
+    lever_b = trajectory.lever_b(gnss.antenna_m)
+    kinematics = trajectory.kinematics(t)
+    offset_n = turned(kinematics.mat_nb, np.broadcast_to(lever_b, (len(t), 3)))
+    swing_n = turned(kinematics.mat_nb, np.cross(kinematics.rate_nb_b, lever_b))
+    return shifted(*trajectory.position(t), offset_n), kinematics.velocity_n + swing_n
+
+
+def gauss_markov(count: int, interval: float, correlation: float, random: np.random.Generator) -> Array:
+    """Stationary first-order Gauss-Markov noise (N, 3) of unit variance."""
+    keep = np.exp(-interval / correlation)
+    draws = random.standard_normal((count, 3))
+    draws[1:] *= np.sqrt(1 - keep * keep)
+    for k in range(1, count):
+        draws[k] += keep * draws[k - 1]
+    return draws
+
+
+def measure(
+    scenario: Scenario,
+    trajectory: Trajectory,
+    t: Array,
+    randoms: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
+) -> Fixes:
+    """The fixes that tell of the times `t` (N,) [s]; the generators are those of white, drifting and velocity noise."""
+    gnss = scenario.gnss
+    place, _ = antenna(trajectory, gnss, t)
+    velocity = smoothed_velocity(trajectory, gnss, t)
+    white = np.array([gnss.sigma_m, gnss.sigma_m, gnss.height_sigma_m])
+    drift = np.array([gnss.drift_sigma_m, gnss.drift_sigma_m, gnss.height_drift_sigma_m])
+    error_n = randoms[0].standard_normal((len(t), 3)) * white
+    error_n += gauss_markov(len(t), 1 / gnss.rate_hz, gnss.correlation_s, randoms[1]) * drift
+    velocity = velocity + randoms[2].standard_normal((len(t), 3)) * gnss.velocity_sigma_mps
+    for jump in gnss.jump:
+        error_n[within(t, [(jump.start_s, jump.stop_s)])] += jump.offset_m
+    for spoof in gnss.spoof:
+        caught = within(t, [(spoof.start_s, spoof.stop_s)])
+        error_n[caught] += np.outer(t[caught] - spoof.start_s, spoof.rate_mps)
+        velocity[caught] += spoof.rate_mps
+    held = last_before(t, within(t, gnss.frozen_s))
+    place = (place[0][held], place[1][held], place[2][held])
+    return _wire(gnss, shifted(*place, error_n[held]), velocity[held], within(t, gnss.no_fix_s))
+
+
+def smoothed_velocity(trajectory: Trajectory, gnss: Gnss, t: Array) -> Array:
+    """Velocity (N, 3) [m/s] of the antenna, a mean over the time 2 x lag before."""
+    if gnss.velocity_lag_ms == 0:
+        return antenna(trajectory, gnss, t)[1]
+    window = 2e-3 * gnss.velocity_lag_ms
+    points = [antenna(trajectory, gnss, t - window * (k + 0.5) / LAG_POINTS)[1] for k in range(LAG_POINTS)]
+    return sum(points[1:], points[0]) / LAG_POINTS
+
+
+def last_before(t: Array, frozen: Mask) -> Integers:
+    """Indices (N,): each its own, while frozen that of the last one before."""
+    own = np.where(frozen, 0, np.arange(len(t)))
+    return np.maximum.accumulate(own)
+
+
+def _wire(gnss: Gnss, place: tuple[Array, Array, Array], velocity: Array, no_fix: Mask) -> Fixes:
+    def whole(values: Array) -> Integers:
+        return np.where(no_fix, 0, np.rint(values).astype(np.int64))
+
+    ellipsoid = place[2] * 1000
+    course = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0])) % 360
+    horizontal = np.hypot(gnss.sigma_m, gnss.drift_sigma_m) if gnss.report_accuracy else 0.0
+    vertical = np.hypot(gnss.height_sigma_m, gnss.height_drift_sigma_m) if gnss.report_accuracy else 0.0
+    return Fixes(
+        fix_type=np.where(no_fix, FIX_NONE, FIX_3D),
+        lat=whole(np.degrees(place[0]) * 1e7),
+        lon=whole(np.degrees(wrapped(place[1])) * 1e7),
+        alt=whole(ellipsoid - gnss.geoid_m * 1000),
+        alt_ellipsoid=whole(ellipsoid),
+        vel=np.where(no_fix, UNKNOWN_16, np.rint(np.hypot(velocity[:, 0], velocity[:, 1]) * 100).astype(np.int64)),
+        cog=np.where(no_fix, UNKNOWN_16, np.rint(course * 100).astype(np.int64) % 36000),
+        h_acc=round(float(horizontal) * 1000),
+        v_acc=round(float(vertical) * 1000),
+        vel_acc=round(gnss.velocity_sigma_mps * 1000) if gnss.report_accuracy else 0,
+    )

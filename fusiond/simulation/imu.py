@@ -1,0 +1,63 @@
+"""The simulated inertial sensor: white noise, wandering bias, vibration in narrow bands, steps of the reading."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusiond.earth import Array
+from fusiond.measurements import Vector3
+from fusiond.simulation.scenario import Imu
+from fusiond.simulation.truth import Motion
+
+VIBRATION_SPEED = 10.0  # m/s, at which the amplitudes of a scenario hold
+
+
+def biases(imu: Imu, count: int, random: np.random.Generator) -> tuple[Array, Array]:
+    """Bias of gyro (N, 3) [rad/s] and accelerometer (N, 3) [m/s^2]: a first value and a random walk."""
+
+    def walk(first: Vector3 | None, sigma: float, density: float) -> Array:
+        drawn = sigma * random.standard_normal(3)
+        steps = random.standard_normal((count, 3)) * (density / np.sqrt(imu.rate_hz))
+        steps[0] = drawn if first is None else first
+        return np.cumsum(steps, axis=0)
+
+    gyro = walk(imu.gyro_bias, imu.gyro_bias_sigma, imu.gyro_bias_walk)
+    return gyro, walk(imu.accel_bias, imu.accel_bias_sigma, imu.accel_bias_walk)
+
+
+def white(imu: Imu, count: int, random: np.random.Generator) -> tuple[Array, Array]:
+    """White noise of gyro (N, 3) [rad/s] and accelerometer (N, 3) [m/s^2]."""
+    both = random.standard_normal((2, count, 3)) * np.sqrt(imu.rate_hz)
+    return both[0] * imu.gyro_noise, both[1] * imu.accel_noise
+
+
+def vibration(imu: Imu, t: Array, speed: Array, random: np.random.Generator) -> tuple[Array, Array]:
+    """Vibration of gyro (N, 3) [rad/s] and accelerometer (N, 3) [m/s^2]: sinusoids of wandering phase."""
+    total = np.zeros((2, len(t), 3))
+    for frequency in imu.vibration_hz:
+        phase = random.standard_normal((2, len(t), 3)) * np.sqrt(2 * np.pi * imu.vibration_width_hz / imu.rate_hz)
+        phase[:, 0] = random.uniform(0, 2 * np.pi, (2, 3))
+        total += np.sin(np.cumsum(phase, axis=1) + (2 * np.pi * frequency * t)[:, None])
+    total *= (np.abs(speed) / VIBRATION_SPEED)[:, None]
+    return total[0] * np.radians(imu.vibration_deg_s), total[1] * imu.vibration_mps2
+
+
+def measure(
+    imu: Imu, t: Array, motion: Motion, randoms: tuple[np.random.Generator, np.random.Generator, np.random.Generator]
+) -> tuple[Array, Array, Array, Array]:
+    """Readings of gyro and accelerometer and their biases, (N, 3) each; the generators are those of bias, noise and
+    vibration."""
+    gyro_bias, accel_bias = biases(imu, len(t), randoms[0])
+    gyro_noise, accel_noise = white(imu, len(t), randoms[1])
+    gyro_shake, accel_shake = vibration(imu, t, motion.speed, randoms[2])
+    gyro = stepped(motion.angular_rate_b + gyro_bias + gyro_noise + gyro_shake, imu.gyro_resolution)
+    accel = stepped(motion.specific_force_b + accel_bias + accel_noise + accel_shake, imu.accel_resolution)
+    return gyro, accel, gyro_bias, accel_bias
+
+
+def stepped(values: Array, step: float) -> Array:
+    """Values rounded to whole steps; 0: not at all."""
+    if step == 0:
+        return values
+    result: Array = np.rint(values / step) * step
+    return result
