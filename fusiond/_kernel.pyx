@@ -115,6 +115,8 @@ cdef double MEAN_TIME = motion.MEAN_TIME
 cdef double MEAN_FILLED = motion.MEAN_FILLED
 cdef int64_t WHEEL_FRESH_NS = motion.WHEEL_FRESH_NS
 cdef double LEAST_TRACK_SPEED = wheel_speed.LEAST_TRACK_SPEED
+cdef double SURE_SPEED = wheel_speed.SURE_SPEED
+cdef double DIRECTION_ALIKE = wheel_speed.DIRECTION_ALIKE
 
 
 def check_layout():
@@ -621,11 +623,13 @@ cdef void point_velocity(double* x, double* auxiliary, double* point, int first,
             jacobian[i * n + MOUNT_ERROR + k] = by[2 * i + k]
 
 
-cdef void wheel(double* x, double* auxiliary, double* row, double* parameter, Observation* seen) noexcept nogil:
+cdef void wheel(double* x, double* p, double* auxiliary, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double v[3]
     cdef double by[3 * n]
     cdef double speed, track, along, across = 0.0, scale = 1 + x[WHEEL_SCALE], reading = row[0]
-    cdef int j, rows = 2 if parameter[4] != 0.0 else 1
+    cdef double reach[n]
+    cdef double variance = row[1], spread, odds, alike, sure
+    cdef int j, k, rows = 2 if parameter[4] != 0.0 else 1
     point_velocity(x, auxiliary, parameter, 0, rows, v, by)
     speed = v[0]
     along = 1.0
@@ -640,16 +644,54 @@ cdef void wheel(double* x, double* auxiliary, double* row, double* parameter, Ob
         for j in range(n):
             seen.jacobian[j] = scale * by[j]
     seen.jacobian[SCALE] = speed
-    if parameter[5] != 0.0 and reading > 0 and speed < 0:
-        reading = -reading
+    if parameter[5] != 0.0 and reading > 0:
+        if fabs(speed) > SURE_SPEED:
+            if speed < 0:
+                reading = -reading
+        else:
+            memset(reach, 0, sizeof(reach))
+            for k in range(n):
+                if seen.jacobian[k] != 0.0:
+                    axpy(reach, seen.jacobian[k], p + k * n)
+            spread = variance
+            for k in range(n):
+                spread += seen.jacobian[k] * reach[k]
+            odds = reading * scale * speed / spread
+            alike = exponential(-2 * fabs(odds))
+            sure = (1 - alike) / (1 + alike)
+            if odds < 0:
+                sure = -sure
+            variance += DIRECTION_ALIKE * reading * reading * (1 - sure * sure)
+            reading *= sure
     seen.m = 1
     seen.innovation[0] = reading - scale * speed
-    seen.variance[0] = row[1]
+    seen.variance[0] = variance
 
 
 # ---------------------------------------------------------------- update (fusiond.update)
 
-cdef double update(double* x, double* p, Observation* seen, double gate, double* spread_diagonal) noexcept nogil:
+cdef bint cholesky(double s[3][3], double* variance, double factor, int m, double low[3][3]) noexcept nogil:
+    """Lower factor of s + factor * variance; whether it is positive definite."""
+    cdef double rest
+    cdef int i, j, k
+    for i in range(m):
+        for j in range(i + 1):
+            rest = s[i][j]
+            if i == j:
+                rest += factor * variance[i]
+            for k in range(j):
+                rest -= low[i][k] * low[j][k]
+            if i == j:
+                if not rest > 0:
+                    return False
+                low[i][i] = sqrt(rest)
+            else:
+                low[i][j] = rest / low[j][j]
+    return True
+
+
+cdef double update(double* x, double* p, Observation* seen, double gate, double factor,
+                   double* spread_diagonal) noexcept nogil:
     """Fuse unless the test ratio exceeds 1; returns the ratio. Infinite: S is not positive definite or not finite."""
     cdef double across[3][n]
     cdef double gain[3][n]
@@ -675,20 +717,10 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double*
                 rest += seen.jacobian[a * n + k] * across[i][k]
             s[a][i] = rest
             s[i][a] = rest
-        s[a][a] += seen.variance[a]
         if spread_diagonal != NULL:
-            spread_diagonal[a] = s[a][a]
-    for i in range(m):
-        for j in range(i + 1):
-            rest = s[i][j]
-            for k in range(j):
-                rest -= low[i][k] * low[j][k]
-            if i == j:
-                if not rest > 0:
-                    return INFINITY
-                low[i][i] = sqrt(rest)
-            else:
-                low[i][j] = rest / low[j][j]
+            spread_diagonal[a] = s[a][a] + seen.variance[a]
+    if not cholesky(s, seen.variance, 1.0, m, low):
+        return INFINITY
     for i in range(m):
         rest = seen.innovation[i]
         for k in range(i):
@@ -698,6 +730,8 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double*
     ratio = ratio / gate
     if not ratio <= 1:
         return ratio if ratio > 1 else INFINITY
+    if factor != 1.0 and not cholesky(s, seen.variance, factor, m, low):
+        return INFINITY
     # gain' = S^-1 (P H')'
     for i in range(m):
         for j in range(n):
@@ -722,7 +756,7 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double*
             if h != 0.0:
                 axpy(kept[a], -h, p + k * n)
     for a in range(m):
-        axpy(kept[a], seen.variance[a], gain[a])
+        axpy(kept[a], factor * seen.variance[a], gain[a])
     for k in range(n):
         for a in range(m):
             axpy(p + k * n, gain[a][k], kept[a])
@@ -759,7 +793,7 @@ cdef class Kernel:
     cdef Noise noise
     cdef int64_t imu_gap, restart_gap, gnss_reset, constraint_interval, still_after, snapshot_interval
     cdef bint standstill, non_holonomic
-    cdef double still_wheel, still_gyro2, still_accel2
+    cdef double still_wheel, still_gyro2, still_accel2, zero_velocity_factor
     cdef double[::1] head_numbers
     cdef int64_t[::1] head_whole
     cdef Row[::1] table
@@ -799,6 +833,7 @@ cdef class Kernel:
         self.still_wheel = plan.motion.still_wheel_mps
         self.still_gyro2 = plan.still_gyro ** 2
         self.still_accel2 = plan.motion.still_accel_mps2 ** 2
+        self.zero_velocity_factor = plan.zero_velocity_factor
         self.numbers_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
 
     cdef int bind(self, double[::1] numbers, int64_t[::1] whole) except -1:
@@ -1076,7 +1111,7 @@ cdef class Kernel:
                 seen.jacobian[i * n + VELOCITY + i] = 1.0
                 seen.innovation[i] = -self.x[VELOCITY_E + i]
                 seen.variance[i] = self.constraints[1, 0]
-            self.apply(1, &seen)
+            self.apply(1, &seen, self.zero_velocity_factor)
             matrix(self.x + QUATERNION_EB, c)
             memset(seen.jacobian, 0, 3 * n * sizeof(double))
             for i in range(3):
@@ -1087,7 +1122,7 @@ cdef class Kernel:
                 seen.innovation[i] = (
                     self.auxiliary[RATE_B + i] - self.x[GYRO_BIAS_B + i] - c[6 + i] * EARTH_RATE)
                 seen.variance[i] = self.constraints[2, 0]
-            self.apply(2, &seen)
+            self.apply(2, &seen, 1.0)
         elif self.non_holonomic:
             parameter = &self.constraints[0, 0]
             point_velocity(self.x, self.auxiliary, parameter, 1, 3, v, by)
@@ -1098,10 +1133,10 @@ cdef class Kernel:
             for i in range(2):
                 seen.innovation[i] = -v[1 + i]
                 seen.variance[i] = parameter[3 + i]
-            self.apply(0, &seen)
+            self.apply(0, &seen, 1.0)
 
-    cdef void apply(self, int which, Observation* seen) noexcept nogil:
-        cdef double ratio = update(self.x, self.p, seen, self.gates[seen.m], NULL)
+    cdef void apply(self, int which, Observation* seen, double factor) noexcept nogil:
+        cdef double ratio = update(self.x, self.p, seen, self.gates[seen.m], factor, NULL)
         self.auxiliary[CONSTRAINT_RATIO + which] = ratio
         self.stamps[(CONSTRAINT_FUSED if ratio <= 1 else CONSTRAINT_REJECTED) + which] += 1
 
@@ -1111,27 +1146,27 @@ cdef class Kernel:
         cdef double* memory = self.memory + row.source * MEMORY_SIZE
         cdef int64_t* stamps = self.source_stamps + row.source * SOURCE_STAMPS_SIZE
         cdef Observation seen
-        cdef double factor = 1.0, interval, alike, ratio
+        cdef double factor = 1.0, interval, alike, ratio, correlation
         if model == WHEEL_SPEED:
             memory[LAST_VALUE] = row.values[0]
-            wheel(self.x, self.auxiliary, row.values, parameter, &seen)
+            wheel(self.x, self.p, self.auxiliary, row.values, parameter, &seen)
         elif model == GNSS_POSITION:
             gnss_position(self.x, row.values, parameter, &seen)
         else:
             gnss_velocity(self.x, self.auxiliary, row.values, parameter, &seen)
-        if parameter[3] > 0 and stamps[T_FUSED] != NEVER:
+        correlation = row.values[2] if model == WHEEL_SPEED else parameter[3]
+        if correlation > 0 and stamps[T_FUSED] != NEVER:
             interval = (row.t_ns - stamps[T_FUSED]) * 1e-9
             if interval < 1e-6:
                 interval = 1e-6
-            alike = exponential(-interval / parameter[3])
+            alike = exponential(-interval / correlation)
             factor = (1 + alike) / (1 - alike)
         for a in range(3):
             row.innovation[a] = 0.0
             row.variance[a] = 0.0
         for a in range(seen.m):
-            seen.variance[a] = seen.variance[a] * factor
             row.innovation[a] = seen.innovation[a]
-        ratio = update(self.x, self.p, &seen, self.gates[seen.m], row.variance)
+        ratio = update(self.x, self.p, &seen, self.gates[seen.m], factor, row.variance)
         row.ratio = ratio
         memory[LAST_RATIO] = ratio
         if not ratio <= 1 and model != WHEEL_SPEED and stamps[T_REJECTED] != NEVER \

@@ -13,8 +13,8 @@ import numpy as np
 
 from fusiond.earth import Array, geodetic_trig, mat_ne_from_trig
 from fusiond.elementary import atan2, sin_cos
-from fusiond.motion import MEAN_FILLED, watch
-from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
+from fusiond.motion import MEAN_FILLED, ZERO_VELOCITY, watch
+from fusiond.observe import gnss_position, gnss_velocity, wheel_speed, zero_velocity
 from fusiond.observe.model import LEVER_ARM_B
 from fusiond.plan import IMU, MODEL, SECOND, Plan
 from fusiond.rotation import matrix_from_euler, quaternion
@@ -98,7 +98,7 @@ def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan
         if plan.filter.heading_deg is not None and _leveled(state):
             variance = (plan.filter.v_max_mps / 3) ** 2
             if stamps[T_STILL] != NEVER:
-                variance = plan.motion.zero_velocity_sigma_mps**2
+                variance = plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE]
             heading, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
             _start(state, source, np.zeros(3), variance, (heading, sigma), plan)
     elif model == MODEL["gnss_velocity"]:

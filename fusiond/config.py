@@ -64,7 +64,7 @@ class Motion(Section, frozen=True, kw_only=True):
     interval_s: Positive = 0.1  # spacing of constraint, zero velocity and zero rotation updates
     minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint rests below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
-    still_wheel_mps: Positive = 0.1  # every wheel at or below this
+    still_wheel_mps: Positive = 0.1  # every wheel at or below this; so fast it may creep unseen
     still_gyro_deg_s: Positive = 0.6  # and the gyro's scatter below this
     still_accel_mps2: Positive = 0.25  # and the accelerometer's scatter below this
     still_after_s: Positive = 0.5  # for this long
@@ -149,6 +149,7 @@ class Wheel(Section, frozen=True, kw_only=True):
     position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
     steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
     sigma_mps: Positive = 0.1  # white noise of one reading
+    least_mps: NotNegative = 0.1  # slower than this it reads 0, or anything
     quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
     correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
     delay_ms: float = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)

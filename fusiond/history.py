@@ -81,8 +81,7 @@ class History:
         at = self._begin + place
         kernel.insert(at, self._end, t_ns, source, sequence, measurement.t_receive_ns, WAITING, values)
         self._end += 1
-        if t_ns > self._newest_ns:
-            self._newest_ns = t_ns
+        self._newest_ns = max(self._newest_ns, t_ns)
         if self.plan.models[source] == IMU and t_ns > self._newest_imu_ns:
             self._newest_imu_ns = t_ns
         first_changed = kernel.first_changed(self._begin, place)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fusiond import alignment
 from fusiond.earth import Array, mat_ne
 from fusiond.motion import constrain, watch
-from fusiond.observe import MODELS
+from fusiond.observe import MODELS, wheel_speed
 from fusiond.observe.model import CORRELATION, VALUES, Observation
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
@@ -306,12 +306,13 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     seen = MODELS[model].observe(state, row["values"], parameters)
     assert seen is not None, "a source's model always observes"
     interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
-    seen = seen._replace(variance=seen.variance * correlation_factor(interval, parameters[CORRELATION]))
+    correlation = row["values"][wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION]
+    factor = correlation_factor(interval, correlation)
     m = len(seen.innovation)
     row["innovation"], row["variance"] = 0.0, 0.0
     row["innovation"][:m] = seen.innovation
     row["variance"][:m] = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian) + seen.variance
-    ratio, fused = update(state, seen, plan.gates[m])
+    ratio, fused = update(state, seen, plan.gates[m], factor)
     if not fused and _locked_out(stamps, t_ns, model, plan):
         _reset_block(state, seen, model)
         fused = True

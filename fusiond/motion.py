@@ -75,18 +75,18 @@ def constrain(state: FilterState, plan: Plan) -> None:
         return
     state.stamps[T_CONSTRAINT] = now
     if state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns:
-        _apply(state, ZERO_VELOCITY, plan)
+        _apply(state, ZERO_VELOCITY, plan, plan.zero_velocity_factor)
         _apply(state, ZERO_ROTATION, plan)
     elif plan.motion.non_holonomic:
         _apply(state, NON_HOLONOMIC, plan)
 
 
-def _apply(state: FilterState, which: int, plan: Plan) -> None:
+def _apply(state: FilterState, which: int, plan: Plan, factor: float = 1.0) -> None:
     parameters = plan.constraints[which]
     seen = CONSTRAINTS[which].observe(state, parameters, parameters)
     if seen is None:
         return
-    ratio, fused = update(state, seen, plan.gates[len(seen.innovation)])
+    ratio, fused = update(state, seen, plan.gates[len(seen.innovation)], factor)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     counts = CONSTRAINT_FUSED if fused else CONSTRAINT_REJECTED
     state.stamps[counts.start + which] += 1

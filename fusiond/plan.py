@@ -20,11 +20,12 @@ from fusiond.observe import (
 )
 from fusiond.observe.model import PARAMETERS
 from fusiond.strapdown import ProcessNoise
-from fusiond.update import chi_square
+from fusiond.update import chi_square, correlation_factor
 
 IMU = -1  # stands for the inertial sensor in a row's `model`
 MODEL = {model.name: number for number, model in enumerate(MODELS)}
 SECOND = 1_000_000_000  # ns
+CREEPING_ALIKE = 1.0  # s: for so long a vehicle that creeps unseen keeps its speed
 
 
 def nanoseconds(seconds: float) -> int:
@@ -48,6 +49,7 @@ class Plan:
     constraint_interval_ns: int
     still_after_ns: int
     still_gyro: float  # rad/s
+    zero_velocity_factor: float  # creeping stays alike: weighs zero velocities down
     filter: Filter
     motion: Motion
     imu: Imu
@@ -98,6 +100,7 @@ def plan(config: Config) -> Plan:
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),
         still_gyro=math.radians(motion.still_gyro_deg_s),
+        zero_velocity_factor=correlation_factor(motion.interval_s, CREEPING_ALIKE),
         filter=settings,
         motion=motion,
         imu=imu,

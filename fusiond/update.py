@@ -92,19 +92,27 @@ def solve_spd(matrix: Array, right: Array) -> Array | None:
     return solution
 
 
-def update(state: FilterState, seen: Observation, gate: float) -> tuple[float, bool]:
+def update(state: FilterState, seen: Observation, gate: float, factor: float = 1.0) -> tuple[float, bool]:
     """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1. Returns the ratio (infinite where S is not
-    positive definite or anything is not finite) and whether it was fused."""
+    positive definite or anything is not finite) and whether it was fused.
+
+    It is judged by its own variance, and weighed by `factor` times that: a sample whose error it shares with the ones
+    before tells little, but is no less wrong when it is far off.
+    """
     innovation, jacobian, variance = seen
     across = state.covariance @ jacobian.T
-    spread = jacobian @ across + np.diag(variance)
-    solved = solve_spd(spread, np.column_stack([innovation, across.T]))
-    if solved is None:
+    predicted = jacobian @ across
+    judged = solve_spd(predicted + np.diag(variance), innovation.reshape(-1, 1))
+    if judged is None:
         return math.inf, False
-    ratio = float(innovation @ solved[:, 0]) / gate
+    ratio = float(innovation @ judged[:, 0]) / gate
     if not ratio <= 1:
         return ratio if ratio > 1 else math.inf, False
-    gain = solved[:, 1:].T
+    variance = factor * variance
+    solved = solve_spd(predicted + np.diag(variance), across.T)
+    if solved is None:
+        return math.inf, False
+    gain = solved.T
     keep = np.eye(state.size) - gain @ jacobian
     covariance = keep @ state.covariance @ keep.T + (gain * variance) @ gain.T
     state.covariance[:] = (covariance + covariance.T) / 2

@@ -1,5 +1,8 @@
 """Speed of one wheel. An unsteered wheel measures the forward speed of its contact point; a steered one rolls along its
-own track, so it measures the horizontal speed of its contact point and needs no steering angle."""
+own track, so it measures the horizontal speed of its contact point and needs no steering angle.
+
+An unsigned reading near standstill is a mixture of two hypotheses, forward and backward; it is collapsed by its moments
+(THEORY B6: Gaussian mixture to Gaussian), so that noise does not choose the direction when the vehicle pulls away."""
 
 from __future__ import annotations
 
@@ -9,26 +12,34 @@ import numpy as np
 
 from fusiond.config import Wheel
 from fusiond.earth import Array
+from fusiond.elementary import exp
 from fusiond.measurements import WheelSpeed
-from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
+from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
 from fusiond.state import SCALE, WHEEL_SCALE, FilterState
 
-SPEED, VARIANCE = 0, 1  # m/s, (m/s)^2, values
+SPEED, VARIANCE, ALIKE = 0, 1, 2  # m/s, (m/s)^2, s over which errors stay alike: values
 STEERED, UNSIGNED = 4, 5  # parameters: 1 or 0
+SLOW_ALIKE = 1.0  # s: for so long at least a slow wheel is slow alike
+SURE_SPEED = 2.0  # m/s: a speed beyond this leaves no doubt of its direction
+DIRECTION_ALIKE = 100.0  # readings: so many share their direction, so they tell no more of it than one
 LEAST_TRACK_SPEED = 0.5  # m/s: below this the direction of a steered wheel's track is not known, and it is taken as forward
 
 
 def parameters(wheel: Wheel) -> Array:
     row = np.zeros(PARAMETERS)
     row[LEVER_ARM_B] = wheel.position_m
-    row[CORRELATION] = wheel.correlation_s
     row[STEERED], row[UNSIGNED] = float(wheel.steered), float(wheel.unsigned)
     return row
 
 
 def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
-    """Speed [m/s] and its variance: the white noise and that of rounding to a quantum, quantum^2/12."""
-    return reading.speed, wheel.sigma_mps**2 + wheel.quantum_mps**2 / 12
+    """Speed [m/s], its variance (the white noise and that of rounding to a quantum, quantum^2/12), and the time over which
+    its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the same
+    from reading to reading."""
+    variance, alike = wheel.sigma_mps**2 + wheel.quantum_mps**2 / 12, wheel.correlation_s
+    if abs(reading.speed) < wheel.least_mps:
+        return reading.speed, variance + wheel.least_mps**2 / 3, max(alike, SLOW_ALIKE)
+    return reading.speed, variance, alike
 
 
 def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
@@ -44,7 +55,20 @@ def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
     scale = 1 + state.nominal[WHEEL_SCALE.start]
     jacobian = scale * (along @ by_error)
     jacobian[SCALE] = speed
-    reading = row[SPEED]
-    if parameter[UNSIGNED] and reading > 0 and speed < 0:
-        reading = -reading
-    return Observation(np.array([reading - scale * speed]), jacobian.reshape(1, -1), np.array([row[VARIANCE]]))
+    reading, variance = row[SPEED], row[VARIANCE]
+    if parameter[UNSIGNED] and reading > 0:
+        if abs(speed) > SURE_SPEED:
+            reading = math.copysign(reading, speed)
+        else:
+            spread = float(jacobian @ state.covariance @ jacobian) + variance
+            sure = direction(reading * scale * speed / spread)
+            variance += DIRECTION_ALIKE * reading * reading * (1 - sure * sure)
+            reading *= sure
+    return Observation(np.array([reading - scale * speed]), jacobian.reshape(1, -1), np.array([variance]))
+
+
+def direction(odds: float) -> float:
+    """Mean sign of an unsigned reading z, with a speed of mean h and variance S - R behind it: the two signs weighed by
+    their likelihoods, tanh(z h / S); `odds` is z h / S."""
+    alike = exp(-2 * abs(odds))
+    return math.copysign((1 - alike) / (1 + alike), odds)

@@ -1,4 +1,5 @@
-"""Zero velocity: the vehicle stands, so its velocity over ground is nothing in every axis."""
+"""Zero velocity: the vehicle stands, so its velocity over ground is nothing in every axis; but for creeping, which wheels
+below `still_wheel_mps` do not tell."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ VARIANCE = 0  # (m/s)^2, parameters
 
 def parameters(motion: Motion) -> Array:
     row = np.zeros(PARAMETERS)
-    row[VARIANCE] = motion.zero_velocity_sigma_mps**2
+    row[VARIANCE] = motion.zero_velocity_sigma_mps**2 + motion.still_wheel_mps**2 / 3
     return row
 
 

@@ -1,0 +1,204 @@
+"""The command line: replay, check, simulate, demo."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from fusiond import __version__, config, demo, report
+from fusiond.comparison import TruthError, Window
+from fusiond.config import ConfigError
+from fusiond.describe import description, oddities
+from fusiond.replay import Options, OutputError, UsageError, parse_interval, parse_withheld, replay
+from fusiond.simulation import scenario
+from fusiond_adapters.can import CanDecoder
+from fusiond_adapters.logs import LogError
+from fusiond_adapters.logs.write import write_drive
+from fusiond_adapters.mavlink import MavlinkDecoder
+
+SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
+
+EXIT_CODES = (
+    "exit codes: 0 success, 1 an input cannot be used or an output not be written, 2 wrong usage or configuration"
+)
+REPLAY = """\
+Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
+belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
+REPLAY_EXAMPLES = """\
+examples:
+  fusiond replay --config car.toml drive.tlog drive.log --csv track.csv
+      fuse a MAVLink log and a candump log into a track
+  fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --window 10-30 --plot errors.png
+      compare seconds 10 to 30 with a reference, and draw the errors
+  fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --withhold gps0:12-22 --window 12-22
+      how far off is it after ten seconds without GNSS?
+  fusiond replay --config car.toml drive.tlog drive.log --speed 1 --publish
+      publish over Zenoh, in real time
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line's grammar."""
+    top = argparse.ArgumentParser(
+        prog="fusiond",
+        description="Fuse a vehicle's IMU, GNSS (MAVLink) and wheel speeds (CAN) into one state with an honest covariance.",
+        epilog=f"Try `fusiond demo` first. {EXIT_CODES}",
+    )
+    top.add_argument("--version", action="version", version=f"fusiond {__version__}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    _add_replay(commands)
+    check = _add(commands, "check", "say what a configuration is going to do, or what is wrong with it")
+    check.epilog = "example:\n  fusiond check --config car.toml"
+    check.add_argument("--config", metavar="C.toml", required=True, help="configuration file")
+    check.set_defaults(run=run_check)
+    simulate = _add(commands, "simulate", "write the logs of a simulated drive, and the truth about it")
+    simulate.epilog = "example:\n  fusiond simulate --config configs/simulate-demo.toml --out drive"
+    simulate.add_argument("--config", metavar="S.toml", required=True, help="scenario file")
+    simulate.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder to write to; made if need be")
+    simulate.add_argument("--seed", metavar="N", type=_seed, help="in place of the scenario's seed")
+    simulate.set_defaults(run=run_simulate)
+    show = _add(commands, "demo", "fuse a bundled drive, and explain what comes out")
+    show.epilog = "example:\n  fusiond demo --out out/demo"
+    show.add_argument("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="default: out/demo")
+    show.set_defaults(run=run_demo)
+    return top
+
+
+def _add(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, about: str
+) -> argparse.ArgumentParser:
+    return commands.add_parser(
+        name, help=about, description=f"{about.capitalize()}.", formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    command = _add(commands, "replay", "fuse recorded logs into a track")
+    command.description, command.epilog = REPLAY, f"{REPLAY_EXAMPLES}\n{EXIT_CODES}"
+    add = command.add_argument
+    add("logs", metavar="LOG", nargs="+", help=".tlog, .log (candump -L), .asc, .blf, .trc, ..., also .gz; or NAME=LOG")
+    add("--config", metavar="C.toml", required=True, help="configuration of the vehicle (see `fusiond check`)")
+    add("--csv", metavar="OUT.csv", type=Path, help="write the track: one row per publication")
+    add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
+    add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
+    add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
+    add("--plot", metavar="OUT.png", type=Path, help="draw the track and, with --truth, its errors (extra `plot`)")
+    add(
+        "--withhold",
+        metavar="SOURCE:START-STOP",
+        action="append",
+        default=[],
+        help="keep a source out between these seconds from the first event, such as gps0:12-22; may be repeated",
+    )
+    add("--rate", metavar="HZ", type=_rate, help="publications per second; default: publish.rate_hz of the config")
+    add("--speed", metavar="X", type=_positive, help="replay at X times real time; default: as fast as possible")
+    add("--publish", action="store_true", help="also publish every state over Zenoh, as configured")
+    command.set_defaults(run=run_replay)
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
+    return value
+
+
+def _rate(text: str) -> float:
+    value = _number(text)
+    if not 0.001 <= value <= 1000:
+        raise argparse.ArgumentTypeError(f"must lie between 0.001 and 1000 Hz, not {text}")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number") from None
+
+
+def _seed(text: str) -> int:
+    if not (text.isascii() and text.isdigit()):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0")
+    return int(text)
+
+
+def run_replay(arguments: argparse.Namespace) -> None:
+    """fusiond replay"""
+    loaded = config.load(arguments.config)
+    if arguments.window and not arguments.truth:
+        raise UsageError("--window limits the comparison with a truth: give --truth as well")
+    options = Options(
+        config=loaded,
+        config_name=Path(arguments.config).name,
+        logs=arguments.logs,
+        csv=arguments.csv,
+        json=arguments.json,
+        truth=arguments.truth,
+        plot=arguments.plot,
+        withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
+        window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
+        rate_hz=arguments.rate,
+        speed=arguments.speed,
+        publish=arguments.publish,
+    )
+    print(report.text(replay(options)))
+
+
+def run_check(arguments: argparse.Namespace) -> None:
+    """fusiond check"""
+    loaded = config.load(arguments.config)
+    for link in loaded.mavlink:
+        MavlinkDecoder(loaded, link)
+    for bus in loaded.can:
+        CanDecoder(loaded, bus)
+    for line in description(loaded):
+        print(line)
+    odd = list(oddities(loaded))
+    for line in odd:
+        print(f"warning: {line}")
+    print(f"{arguments.config}: can be used" + (f", with {len(odd)} warning(s)" if odd else ""))
+
+
+def run_simulate(arguments: argparse.Namespace) -> None:
+    """fusiond simulate"""
+    for path in write_drive(scenario.load(arguments.config), arguments.out, arguments.seed):
+        print(f"{path}  {path.stat().st_size / 1e3:.0f} kB")
+
+
+def run_demo(arguments: argparse.Namespace) -> None:
+    """fusiond demo"""
+    demo.run(arguments.out)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code. A wrong command line ends with SystemExit(2), as argparse does."""
+    arguments = parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+        sys.stdout.flush()
+    except (ConfigError, UsageError) as error:
+        return _failed(str(error), USAGE)
+    except (LogError, TruthError, OutputError) as error:
+        return _failed(str(error), UNUSABLE)
+    except BrokenPipeError:  # whoever read our output has gone; keep the interpreter from flushing into it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNUSABLE
+    except OSError as error:
+        return _failed(f"{error.filename or 'input or output'}: {error.strerror or error}", UNUSABLE)
+    except KeyboardInterrupt:
+        return _failed("interrupted", INTERRUPTED)
+    return SUCCESS
+
+
+def _failed(message: str, code: int) -> int:
+    print(f"fusiond: {message}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
