@@ -22,9 +22,7 @@ from fusiond_adapters.mavlink import MavlinkDecoder
 
 SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
 
-EXIT_CODES = (
-    "exit codes: 0 success, 1 an input cannot be used or an output not be written, 2 wrong usage or configuration"
-)
+EXIT_CODES = "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 130 interrupted"
 REPLAY = """\
 Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
 belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
@@ -45,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line's grammar."""
     top = argparse.ArgumentParser(
         prog="fusiond",
-        description="Fuse a vehicle's IMU, GNSS (MAVLink) and wheel speeds (CAN) into one state with an honest covariance.",
+        description="Fuse a vehicle's IMU, GNSS (MAVLink) and wheel speeds (CAN) into one state that knows its errors.",
         epilog=f"Try `fusiond demo` first. {EXIT_CODES}",
     )
     top.add_argument("--version", action="version", version=f"fusiond {__version__}")
@@ -68,9 +66,7 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _add(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, about: str
-) -> argparse.ArgumentParser:
+def _add(commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, about: str) -> argparse.ArgumentParser:
     return commands.add_parser(
         name, help=about, description=f"{about.capitalize()}.", formatter_class=argparse.RawDescriptionHelpFormatter
     )

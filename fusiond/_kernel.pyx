@@ -468,8 +468,9 @@ cdef void grow(double* p, double dt, double* f, double* c, double* grad) noexcep
 
 cdef void propagate(double* x, double* p, double dt, double* force_b, double* rate_b,
                     Noise* noise) noexcept nogil:
-    cdef int parts = <int>(dt / LONGEST_STEP), i
-    if parts * LONGEST_STEP < dt:
+    cdef double steps = dt / LONGEST_STEP
+    cdef int parts = <int>steps, i
+    if parts < steps:
         parts += 1
     if parts < 1:
         parts = 1
@@ -671,7 +672,7 @@ cdef void wheel(double* x, double* p, double* auxiliary, double* row, double* pa
 # ---------------------------------------------------------------- update (fusiond.update)
 
 cdef bint cholesky(double s[3][3], double* variance, double factor, int m, double low[3][3]) noexcept nogil:
-    """Lower factor of s + factor * variance; whether it is positive definite."""
+    """Lower factor of s + factor * variance; whether it is positive definite, and the variance not negative."""
     cdef double rest
     cdef int i, j, k
     for i in range(m):
@@ -682,7 +683,7 @@ cdef bint cholesky(double s[3][3], double* variance, double factor, int m, doubl
             for k in range(j):
                 rest -= low[i][k] * low[j][k]
             if i == j:
-                if not rest > 0:
+                if not (variance[i] >= 0 and 0 < rest < INFINITY):
                     return False
                 low[i][i] = sqrt(rest)
             else:
@@ -981,7 +982,7 @@ cdef class Kernel:
     cdef void step(self, Row* rows, Py_ssize_t index, Row* imu, Py_ssize_t whole_size) noexcept nogil:
         cdef Row* row = rows + index
         row.ratio = 0.0
-        if index > 0 and rows[index - 1].t_ns == row.t_ns and rows[index - 1].source == row.source:
+        if self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] == row.t_ns:
             row.outcome = DUPLICATE
             return
         row.outcome = FUSED

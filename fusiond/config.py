@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args, get_origin
 
@@ -80,6 +81,9 @@ class Mavlink(Section, frozen=True, kw_only=True):
     dialect: Name = "common"  # pymavlink dialect, "common" or "ardupilotmega"
     system: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this system id; 0: the first autopilot heard
     component: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this component id; 0: every one
+    own_system: Annotated[int, Meta(ge=0, le=255)] = 0  # fusiond's own system id, live; 0: that of the autopilot
+    own_component: Annotated[int, Meta(ge=1, le=255)] = 191  # fusiond's own component id (191: onboard computer)
+    request: bool = True  # live: ask the autopilot for the messages needed, at the rates of [imu] and [gnss]
 
 
 class Can(Section, frozen=True, kw_only=True):
@@ -91,6 +95,7 @@ class Can(Section, frozen=True, kw_only=True):
     channel: str | None = None  # python-can channel; default: python-can's own configuration
     config_context: str | None = None  # section of python-can's own configuration file
     fd: bool = False  # CAN FD
+    bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], where the interface does not set it
     delay_ms: NotNegative = 0.0  # how old a frame is when it is received
 
 
@@ -100,6 +105,7 @@ class Imu(Section, frozen=True, kw_only=True):
     link: Name  # the [mavlink.LINK] it comes by
     message: Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"] = "HIGHRES_IMU"
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
+    rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to ask the autopilot for, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
     delay_ms: float = 0.0  # how long before its stamp the sample was true
     accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
@@ -172,6 +178,21 @@ class Zenoh(Section, frozen=True, kw_only=True):
     config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
 
 
+class Live(Section, frozen=True, kw_only=True):
+    """[live]: how `fusiond run` treats its inputs."""
+
+    queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 4096  # of each input; when full the oldest is dropped
+    reopen_max_s: Annotated[float, Meta(gt=0, le=600)] = 5.0  # longest pause before a lost input is opened again
+
+
+class Record(Section, frozen=True, kw_only=True):
+    """[record]: the black box of `fusiond run`: what was received, as .tlog and candump .log."""
+
+    folder: str | None = None  # where to, relative to this file; none: nothing is recorded
+    file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # a file that has grown to this is followed by another
+    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all together exceed this
+
+
 class Config(Section, frozen=True, kw_only=True):
     """The whole file."""
 
@@ -180,6 +201,8 @@ class Config(Section, frozen=True, kw_only=True):
     motion: Motion = field(default_factory=Motion)
     publish: Publish = field(default_factory=Publish)
     zenoh: Zenoh = field(default_factory=Zenoh)
+    live: Live = field(default_factory=Live)
+    record: Record = field(default_factory=Record)
     mavlink: dict[Name, Mavlink] = field(default_factory=dict)
     can: dict[Name, Can] = field(default_factory=dict)
     imu: dict[Name, Imu] = field(default_factory=dict)
@@ -260,24 +283,31 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
         refer("gnss", name, "link", gnss.link, config.mavlink)
     for name, wheel in config.wheel.items():
         refer("wheel", name, "bus", wheel.bus, config.can)
-        if wheel.unit in ("rad/s", "rpm") and wheel.radius_m is None:
-            found.append((f"wheel.{name}.unit", f"{wheel.unit} needs radius_m"))
-        if wheel.scale == 0:
-            found.append((f"wheel.{name}.scale", "must not be 0"))
-    for name, can in config.can.items():
-        for dbc in can.dbc:
-            if not config.path(dbc).is_file():
-                found.append((f"can.{name}.dbc", f"no such file: {config.path(dbc)}"))
-        if not can.dbc and any(wheel.bus == name for wheel in config.wheel.values()):
-            found.append((f"can.{name}", "its wheels need a DBC file: dbc = [\"FILE.dbc\"]"))
+    found += _contradictions_on_can(config)
     if len(config.imu) != 1:
         found.append(("imu", f"exactly one [imu.NAME] is needed, found {len(config.imu)}"))
     names = [*config.imu, *config.gnss, *config.wheel]
     for name in sorted({name for name in names if names.count(name) > 1}):
         found.append((name, "names two sources; every source needs a name of its own"))
+    if config.record.file_mb * 2 > config.record.total_mb:
+        found.append(("record.total_mb", f"must be at least twice file_mb ({config.record.file_mb:g} MB)"))
     if config.filter.imu_gap_s >= config.filter.horizon_s:
         found.append(("filter.imu_gap_s", f"must be below horizon_s ({config.filter.horizon_s} s)"))
     return found
+
+
+def _contradictions_on_can(config: Config) -> Iterator[tuple[str, str]]:
+    for name, wheel in config.wheel.items():
+        if wheel.unit in ("rad/s", "rpm") and wheel.radius_m is None:
+            yield f"wheel.{name}.unit", f"{wheel.unit} needs radius_m"
+        if wheel.scale == 0:
+            yield f"wheel.{name}.scale", "must not be 0"
+    for name, can in config.can.items():
+        for dbc in can.dbc:
+            if not config.path(dbc).is_file():
+                yield f"can.{name}.dbc", f"no such file: {config.path(dbc)}"
+        if not can.dbc and any(wheel.bus == name for wheel in config.wheel.values()):
+            yield f"can.{name}", 'its wheels need a DBC file: dbc = ["FILE.dbc"]'
 
 
 def _explain(

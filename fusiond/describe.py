@@ -34,7 +34,8 @@ def description(config: Config) -> Iterator[str]:
     yield f"constraints  {'; '.join(filter(None, constraints)) or 'none'}"
     yield f"horizon      {settings.horizon_s:g} s: a measurement up to so late is put where it belongs in time"
     yield f"start        {_start(config)}"
-    yield f"publishes    fusiond/{config.vehicle.name}/state at {config.publish.rate_hz:g} Hz as {config.publish.encoding}"
+    publish = config.publish
+    yield f"publishes    fusiond/{config.vehicle.name}/state at {publish.rate_hz:g} Hz as {publish.encoding}"
     yield f"Zenoh        {_zenoh(config)}"
 
 
@@ -55,7 +56,8 @@ def _gnss(name: str, gnss: Gnss) -> Iterator[str]:
 
 
 def _wheel(name: str, wheel: Wheel) -> Iterator[str]:
-    yield f"wheel        {name}: {wheel.message}.{wheel.signal} of {wheel.bus} in {wheel.unit}, {_delay(wheel.delay_ms)}"
+    signal = f"{wheel.message}.{wheel.signal}"
+    yield f"wheel        {name}: {signal} of {wheel.bus} in {wheel.unit}, {_delay(wheel.delay_ms)}"
     kind = "steered" if wheel.steered else "not steered"
     sign = "amount only" if wheel.unsigned and not wheel.direction_signal else "with direction"
     factor = f", times {wheel.scale:g}" if wheel.scale != 1 else ""
@@ -82,7 +84,7 @@ def _start(config: Config) -> str:
 
 def _zenoh(config: Config) -> str:
     zenoh = config.zenoh
-    parts = [zenoh.mode]
+    parts: list[str] = [zenoh.mode]
     parts += [f"listens on {', '.join(zenoh.listen)}"] if zenoh.listen else []
     parts += [f"connects to {', '.join(zenoh.connect)}"] if zenoh.connect else []
     parts += [f"file {zenoh.config_file}"] if zenoh.config_file else []
@@ -115,17 +117,11 @@ def oddities(config: Config) -> Iterator[str]:
             )
         if delay_ms < 0:
             yield f"{kind}: a delay of {delay_ms:g} ms says that it tells the future"
-    for name, gnss in config.gnss.items():
-        if not any(gnss.lever_arm_m):
-            yield f"gnss.{name}.lever_arm_m: the antenna is taken to be in the IMU itself"
-    for name, wheel in config.wheel.items():
-        if not any(wheel.position_m):
-            yield f"wheel.{name}.position_m: the wheel is taken to be in the IMU itself"
     for key, point in _points(config):
         if max(map(abs, point)) > FAR_M:
             yield f"{key}: {_place(point)} is far from the IMU; is it in metres?"
-    if config.wheel and config.motion.non_holonomic and not any(config.motion.point_m):
-        yield "motion.point_m: the IMU is taken to sit on the unsteered axle, where the vehicle never slides sideways"
+        elif not any(point):
+            yield f"{key}: 0 0 0 puts it where the IMU is; is it measured?"
     if config.can and not config.wheel:
         yield "no [wheel.NAME] uses the [can.NAME] buses: nothing of them will be read"
 
@@ -142,7 +138,8 @@ def _delays(config: Config) -> Iterator[tuple[str, float]]:
 
 
 def _points(config: Config) -> Iterator[tuple[str, Vector3]]:
-    yield "motion.point_m", config.motion.point_m
+    if config.motion.non_holonomic:
+        yield "motion.point_m", config.motion.point_m
     for name, gnss in config.gnss.items():
         yield f"gnss.{name}.lever_arm_m", gnss.lever_arm_m
     for name, wheel in config.wheel.items():

@@ -28,7 +28,9 @@ ATAN = (
 
 
 def sin_cos(x: float) -> tuple[float, float]:
-    """Sine and cosine of an angle [rad] of moderate size (below 1e5)."""
+    """Sine and cosine of an angle [rad] of moderate size (below 1e5); nan where it is not finite."""
+    if not math.isfinite(x):
+        return math.nan, math.nan
     turns = math.floor(x / (HALF_PI_HIGH + HALF_PI_LOW) + 0.5)
     high, low = x - turns * HALF_PI_HIGH, turns * HALF_PI_LOW
     r = high - low
@@ -101,7 +103,9 @@ def asin(x: float) -> float:
 
 
 def exp(x: float) -> float:
-    """Exponential; 0 below -700, infinite above 700."""
+    """Exponential; 0 below -700, infinite above 700, nan of nan."""
+    if math.isnan(x):
+        return x
     if x < -700.0:
         return 0.0
     if x > 700.0:

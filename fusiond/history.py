@@ -90,7 +90,7 @@ class History:
         if first_changed < self._applied:
             self._rewind(first_changed)
         self._run()
-        outcome = OUTCOMES[kernel.outcome(at)]
+        outcome: Outcome = OUTCOMES[kernel.outcome(at)]
         self._until_forgetting -= 1
         if not self._until_forgetting:
             self._forget()

@@ -226,7 +226,7 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
     row = rows[index]
     t_ns, source, values = int(row["t_ns"]), int(row["source"]), row["values"]
     row["ratio"] = 0.0
-    if index > 0 and rows[index - 1]["t_ns"] == t_ns and rows[index - 1]["source"] == source:
+    if state.source_stamps[source, T_LAST] == t_ns:
         row["outcome"] = Outcome.DUPLICATE
         return
     stamps = state.stamps

@@ -45,7 +45,8 @@ def watch(state: FilterState, force_b: Array, rate_b: Array, dt: float, plan: Pl
     ):
         off = sample - auxiliary[mean]
         auxiliary[mean] += step * off
-        auxiliary[scatter] = (1 - step) * (auxiliary[scatter] + step * float(off[0] * off[0] + off[1] * off[1] + off[2] * off[2]))
+        square = float(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        auxiliary[scatter] = (1 - step) * (auxiliary[scatter] + step * square)
     if not stands(state, plan):
         state.stamps[T_STILL] = NEVER
     elif state.stamps[T_STILL] == NEVER:

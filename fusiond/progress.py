@@ -41,6 +41,4 @@ def line(share: float, recorded_s: float, real_s: float) -> str:
     done = min(1.0, max(0.0, share))
     full = round(done * WIDTH)
     pace = recorded_s / real_s if real_s > 0 else 0.0
-    return (
-        f"[{'#' * full}{'.' * (WIDTH - full)}] {100 * done:3.0f} %  {recorded_s:.0f} s of drive, {pace:.0f} x real time"
-    )
+    return f"[{'#' * full}{'.' * (WIDTH - full)}] {100 * done:3.0f} %  {recorded_s:.0f} s of drive, {pace:.0f} x real time"

@@ -62,7 +62,8 @@ def _step(state: FilterState, dt: float, force_b: Array, rate_b: Array, noise: P
     turn = (rate_b - x[GYRO_BIAS_B]) * dt
     earth_turn = EARTH_RATE_E * -dt
     quaternion_eb = x[QUATERNION_EB]
-    middle = quaternion_multiply(quaternion_exp(earth_turn / 2), quaternion_multiply(quaternion_eb, quaternion_exp(turn / 2)))
+    half_turned = quaternion_multiply(quaternion_eb, quaternion_exp(turn / 2))
+    middle = quaternion_multiply(quaternion_exp(earth_turn / 2), half_turned)
     mat_eb = matrix(middle)
     force_e = mat_eb @ force
     velocity_e = x[VELOCITY_E].copy()

@@ -68,18 +68,18 @@ def correlation_factor(interval: float, correlation: float) -> float:
     if correlation <= 0:
         return 1.0
     alike = exp(-max(interval, 1e-6) / correlation)
-    return (1 + alike) / (1 - alike)
+    return (1 + alike) / (1 - alike) if alike < 1 else math.inf
 
 
 def solve_spd(matrix: Array, right: Array) -> Array | None:
-    """matrix^-1 right for a symmetric positive definite matrix (m, m), by Cholesky; None where it is not."""
+    """matrix^-1 right for a finite, symmetric positive definite matrix (m, m), by Cholesky; None where it is not."""
     m = len(matrix)
     lower = np.zeros((m, m))
     for i in range(m):
         for j in range(i + 1):
             rest = matrix[i, j] - lower[i, :j] @ lower[j, :j]
             if i == j:
-                if not rest > 0:
+                if not 0 < rest < math.inf:
                     return None
                 lower[i, i] = math.sqrt(rest)
             else:
@@ -94,12 +94,14 @@ def solve_spd(matrix: Array, right: Array) -> Array | None:
 
 def update(state: FilterState, seen: Observation, gate: float, factor: float = 1.0) -> tuple[float, bool]:
     """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1. Returns the ratio (infinite where S is not
-    positive definite or anything is not finite) and whether it was fused.
+    positive definite, a variance negative or anything not finite) and whether it was fused.
 
     It is judged by its own variance, and weighed by `factor` times that: a sample whose error it shares with the ones
     before tells little, but is no less wrong when it is far off.
     """
     innovation, jacobian, variance = seen
+    if not (variance >= 0).all():
+        return math.inf, False
     across = state.covariance @ jacobian.T
     predicted = jacobian @ across
     judged = solve_spd(predicted + np.diag(variance), innovation.reshape(-1, 1))

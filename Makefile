@@ -1,0 +1,50 @@
+# make demo    fuse a bundled drive, and explain the result (out/demo)
+# make test    lint, types, tests
+# make study   the long studies; make bench the benchmarks
+# make clean   remove what was made
+# All set-up is done as needed, in a virtual environment of its own (.venv). PYTHON chooses the interpreter, 3.11 or later.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/ready
+TYPING := build/typing/fusiond_adapters
+DEMO := fusiond/data/demo
+
+.PHONY: demo test lint study bench demo-data clean
+
+demo: $(READY)
+	$(BIN)/fusiond demo --out out/demo
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: $(READY) $(TYPING)
+	$(BIN)/ruff check .
+	$(BIN)/python -m mypy
+
+study: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+bench: $(READY)
+	set -e; for file in benchmarks/*.py; do $(BIN)/python $$file; done
+
+# The bundled drive: the simulator's, packed so that the same scenario gives the same bytes.
+demo-data: $(READY)
+	$(BIN)/fusiond simulate --config configs/simulate-demo.toml --out $(DEMO)
+	gzip -9nf $(DEMO)/drive.tlog $(DEMO)/drive.log $(DEMO)/truth.csv
+
+$(READY): pyproject.toml setup.py fusiond/_kernel.pyx
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+# mypy looks for fusiond_adapters by its import name, which is not its folder's.
+$(TYPING):
+	mkdir -p $(@D)
+	ln -sfn ../../adapters $@
+
+clean:
+	rm -rf $(VENV) build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
