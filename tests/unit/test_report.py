@@ -143,7 +143,7 @@ def test_a_state_is_inside_its_ellipse_by_its_own_covariance() -> None:
             lon = 11.0 - east * sigmas / displacement(48.0, 12.0, (48.0, 11.0), 500.0)[1]
             errors = errors_of(message(), HERE._replace(lat_deg=lat, lon_deg=lon))
             assert errors is not None
-            assert (errors.north_m, errors.east_m) == pytest.approx((north * sigmas, east * sigmas), rel=1e-3)
+            assert (errors.north_m, errors.east_m) == pytest.approx((north * sigmas, east * sigmas), rel=1e-3, abs=1e-6)
             assert errors.inside is inside
 
 
