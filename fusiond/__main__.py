@@ -1,8 +1,10 @@
-"""The command line: replay, check, simulate, demo."""
+"""The command line: run, replay, check, simulate, demo."""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import logging
 import math
 import os
 import sys
@@ -23,6 +25,10 @@ from fusiond_adapters.mavlink import MavlinkDecoder
 SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
 
 EXIT_CODES = "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 130 interrupted"
+RUN = """\
+Take the live inputs of a configuration and publish the state over Zenoh, until SIGTERM or SIGINT. An input that is away
+is waited for. SIGHUP reloads the configuration: connections, message rates and [record] change while running; with
+anything else changed the reload is refused as a whole, and the log says why."""
 REPLAY = """\
 Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
 belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
@@ -48,6 +54,10 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"fusiond {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    run = _add(commands, "run", "fuse the live inputs, and publish the state")
+    run.description, run.epilog = RUN, f"example:\n  fusiond run --config car.toml\n\n{EXIT_CODES}"
+    run.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
+    run.set_defaults(run=run_daemon)
     _add_replay(commands)
     check = _add(commands, "check", "say what a configuration is going to do, or what is wrong with it")
     check.epilog = "example:\n  fusiond check --config car.toml"
@@ -121,6 +131,18 @@ def _seed(text: str) -> int:
     if not (text.isascii() and text.isdigit()):
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0")
     return int(text)
+
+
+def run_daemon(arguments: argparse.Namespace) -> None:
+    """fusiond run"""
+    from fusiond.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
+
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+
+    def load() -> config.Config:
+        return config.load(arguments.config)
+
+    asyncio.run(serve(Daemon(load(), load)))
 
 
 def run_replay(arguments: argparse.Namespace) -> None:

@@ -17,6 +17,7 @@ Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="letters, dig
 Vector = tuple[float, float, float]
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 Encoding = Literal["json", "msgpack"]
+ImuMessage = Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"]
 
 
 class ConfigError(Exception):
@@ -60,8 +61,8 @@ class Motion(Section, frozen=True, kw_only=True):
 
     non_holonomic: bool = True  # no sideways or vertical speed at the point below
     point_m: Vector = (0.0, 0.0, 0.0)  # where it holds, from the IMU: the middle of the unsteered axle
-    lateral_sigma_mps: Positive = 0.2
-    vertical_sigma_mps: Positive = 0.3
+    lateral_sigma_mps: Positive = 0.2  # how far the point may slip sideways: sigma of that constraint
+    vertical_sigma_mps: Positive = 0.3  # likewise up and down: suspension
     interval_s: Positive = 0.1  # spacing of constraint, zero velocity and zero rotation updates
     minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint rests below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
@@ -69,8 +70,8 @@ class Motion(Section, frozen=True, kw_only=True):
     still_gyro_deg_s: Positive = 0.6  # and the gyro's scatter below this
     still_accel_mps2: Positive = 0.25  # and the accelerometer's scatter below this
     still_after_s: Positive = 0.5  # for this long
-    zero_velocity_sigma_mps: Positive = 0.02
-    zero_rotation_sigma_deg_s: Positive = 0.1
+    zero_velocity_sigma_mps: Positive = 0.02  # sigma of the velocity at standstill, per axis
+    zero_rotation_sigma_deg_s: Positive = 0.1  # sigma of the angular rate at standstill, per axis
 
 
 class Mavlink(Section, frozen=True, kw_only=True):
@@ -103,7 +104,7 @@ class Imu(Section, frozen=True, kw_only=True):
     """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
 
     link: Name  # the [mavlink.LINK] it comes by
-    message: Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"] = "HIGHRES_IMU"
+    message: ImuMessage = "HIGHRES_IMU"  # the message that carries it
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
     rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to ask the autopilot for, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
@@ -122,7 +123,7 @@ class Gnss(Section, frozen=True, kw_only=True):
     """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
 
     link: Name  # the [mavlink.LINK] it comes by
-    message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"
+    message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"  # the message that carries it
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
     delay_ms: float = 0.0  # how long before its stamp the position was true
     velocity_delay_ms: float = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
@@ -132,8 +133,8 @@ class Gnss(Section, frozen=True, kw_only=True):
     velocity_sigma_mps: Positive = 0.2  # likewise, per axis
     position_correlation_s: NotNegative = 0.0  # time over which position errors stay alike: weighs dense fixes down
     velocity_correlation_s: NotNegative = 0.0  # likewise, velocity
-    use_velocity: bool = True
-    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3
+    use_velocity: bool = True  # fuse speed and course as well
+    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # GPS_FIX_TYPE that a fix must have at least; 3: 3-D
     interval_s: Positive = 0.2  # expected spacing of fixes
 
 
@@ -148,9 +149,9 @@ class Wheel(Section, frozen=True, kw_only=True):
     scale: float = 1.0  # known factor on the signal; negative where it counts backwards
     unsigned: bool = True  # the signal tells the amount only, not the direction
     direction_signal: str | None = None  # a signal whose value reverse_value means driving backwards
-    reverse_value: int = 1
+    reverse_value: int = 1  # what direction_signal reads when driving backwards
     valid_signal: str | None = None  # a signal that must equal valid_value
-    valid_value: int = 0
+    valid_value: int = 0  # what valid_signal must read
     counter_signal: str | None = None  # a rolling counter; a repeated value marks a stale frame
     position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
     steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
@@ -171,10 +172,10 @@ class Publish(Section, frozen=True, kw_only=True):
 class Zenoh(Section, frozen=True, kw_only=True):
     """[zenoh]: where the state is published. Loopback and no scouting unless said otherwise."""
 
-    mode: Literal["peer", "client", "router"] = "peer"
-    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])
-    connect: list[str] = field(default_factory=list)
-    multicast_scouting: bool = False
+    mode: Literal["peer", "client", "router"] = "peer"  # a client needs a router, a peer does not
+    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # endpoints to listen on
+    connect: list[str] = field(default_factory=list)  # endpoints to connect to
+    multicast_scouting: bool = False  # find and be found by others on the local network
     config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
 
 
@@ -188,9 +189,9 @@ class Live(Section, frozen=True, kw_only=True):
 class Record(Section, frozen=True, kw_only=True):
     """[record]: the black box of `fusiond run`: what was received, as .tlog and candump .log."""
 
-    folder: str | None = None  # where to, relative to this file; none: nothing is recorded
+    folder: str | None = None  # such as "/var/lib/fusiond/box"; none: nothing is recorded
     file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # a file that has grown to this is followed by another
-    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all together exceed this
+    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
 
 
 class Config(Section, frozen=True, kw_only=True):

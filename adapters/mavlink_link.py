@@ -1,0 +1,91 @@
+"""MAVLink live: one link's thread, from a transport to frames in the inbox, and back what fusiond has to say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Event
+
+from fusiond.config import Config, ConfigError
+from fusiond.measurements import Received
+
+from .host_clock import HostClock
+from .inputs import POLL_S, Inbox, InputLost
+from .logs.tlog import STAMP
+from .mavlink import FrameSplitter, MavlinkDecoder
+from .mavlink_talk import MavlinkTalk
+from .transport import Transport, opener
+
+
+class MavlinkLink:
+    """One [mavlink.NAME]. `alive` tells whether the estimator works: only then are heartbeats sent.
+
+    Raises ConfigError where the connection string is none, or the dialect lacks a wanted message.
+    """
+
+    def __init__(
+        self, config: Config, link: str, inbox: Inbox[bytes], clock: HostClock, alive: Callable[[], bool]
+    ) -> None:
+        self.name = link
+        self.file = f"{link}.tlog"
+        self.inbox = inbox
+        self.decoder = MavlinkDecoder(config, link)
+        self.sessions = self.skipped_bytes = self.sent = 0
+        self._clock, self._alive = clock, alive
+        self.configure(config)
+
+    def configure(self, config: Config) -> None:
+        """Take connection, own ids and requests of a configuration, for the sessions to come. Raises ConfigError."""
+        settings = config.mavlink[self.name]
+        try:
+            self._open = opener(settings.connection, settings.baud)
+        except ValueError as error:
+            raise ConfigError(f"mavlink.{self.name}.connection: {error}") from error
+        self.about = f"MAVLink {self.name} ({settings.connection})"
+        self.talk = MavlinkTalk(config, self.name)
+
+    def session(self, stop: Event) -> None:
+        """Open the link, read it until told to stop, close it. Raises InputLost."""
+        try:
+            transport = self._open()
+        except OSError as error:
+            raise InputLost(f"cannot be opened: {_reason(error)}") from error
+        self.sessions += 1
+        try:
+            self._serve(transport, stop)
+        except (OSError, EOFError) as error:
+            raise InputLost(f"lost: {_reason(error)}") from error
+        finally:
+            transport.close()
+
+    def _serve(self, transport: Transport, stop: Event) -> None:
+        splitter = FrameSplitter(self.decoder.dialect)
+        skipped_before = self.skipped_bytes
+        while not stop.is_set():
+            chunks = transport.read(POLL_S)
+            t_ns = self._clock.now_ns()
+            for chunk in chunks:
+                for frame in splitter.feed(chunk):
+                    self.inbox.put(t_ns, frame)
+                    self.talk.hear(frame, t_ns)
+            self.skipped_bytes = skipped_before + splitter.skipped_bytes
+            for said in self.talk.say(t_ns, alive=self._alive()):
+                transport.write(said)
+                self.sent += 1
+
+    def decode(self, item: bytes, t_ns: int) -> list[Received]:
+        """The events in a frame."""
+        return self.decoder.decode(item, t_ns)
+
+    def record(self, item: bytes, t_ns: int) -> bytes:
+        """A record of a .tlog."""
+        return STAMP.pack(t_ns // 1000) + item
+
+    def counts(self) -> dict[str, int]:
+        """What became of the frames so far, and of the link."""
+        own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
+        asked = {f"asked for {name}": wanted.asked for name, wanted in self.talk.wanted.items()}
+        return {**own, "reboots": self.talk.reboots, **asked, **self.decoder.counts}
+
+
+def _reason(error: OSError | EOFError) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__

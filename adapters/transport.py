@@ -1,0 +1,250 @@
+"""Byte transports of MAVLink links, by pymavlink's connection strings. Nothing is printed, no loss goes unnoticed.
+
+    udpin:HOST:PORT     listen; answers go to whoever was heard within the last minute (udp:HOST:PORT is the same)
+    udpout:HOST:PORT    send there first, hear what comes back
+    udpbcast:HOST:PORT  likewise, to a broadcast address
+    tcp:HOST:PORT       connect
+    tcpin:HOST:PORT     listen; the latest to connect is the peer
+    uds:PATH            connect to a Unix domain socket (unix:PATH is the same)
+    DEVICE[,BAUD]       a serial line
+
+pymavlink's own classes are of no use here: they print, sleep, take the end of a stream for silence and swallow errors.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import serial
+
+CHUNK = 65536  # bytes read at a time; no UDP datagram is longer
+CONNECT_TIMEOUT_S = 5.0
+FORGET_S = 60.0  # a UDP peer unheard for so long gets no more answers
+MOST_PEERS = 16
+
+
+class Transport(Protocol):
+    """An open way to a peer. Every method may raise OSError or EOFError: the way is lost."""
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        """What has come, after waiting for it up to `timeout_s`."""
+
+    def write(self, data: bytes) -> None:
+        """Send to the peer, if there is one. What the line does not take at once is lost."""
+
+    def close(self) -> None: ...
+
+
+def opener(connection: str, baud: int) -> Callable[[], Transport]:
+    """What opens the transport that a connection string names; it raises OSError where that fails. Raises ValueError
+    where the string names none."""
+    scheme, colon, rest = connection.partition(":")
+    if scheme in ("uds", "unix"):
+        return lambda: _Stream(_unix_socket(rest))
+    if scheme in _BY_ADDRESS and colon:
+        make, address = _BY_ADDRESS[scheme], _address(connection, rest)
+        return lambda: make(address)
+    if colon:
+        raise ValueError(f"'{connection}': unknown kind of connection; known: {', '.join(_BY_ADDRESS)}, uds, DEVICE,BAUD")
+    device, _, given = connection.partition(",")
+    if not device or (given and not given.isdecimal()):
+        raise ValueError(f"'{connection}': a serial line is DEVICE or DEVICE,BAUD")
+    return lambda: _Serial(device, int(given) if given else baud)
+
+
+def _address(connection: str, rest: str) -> tuple[str, int]:
+    host, _, port = rest.rpartition(":")
+    if not host or not port.isdecimal() or not 0 <= int(port) <= 65535:
+        raise ValueError(f"'{connection}': HOST:PORT is wanted after the first colon")
+    return host, int(port)
+
+
+def _unix_socket(path: str) -> socket.socket:
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        made.connect(path)
+    except OSError:
+        made.close()
+        raise
+    return made
+
+
+def _wait(sockets: list[socket.socket], timeout_s: float) -> list[socket.socket]:
+    return select.select(sockets, [], [], timeout_s)[0]
+
+
+class _Udp:
+    """What both directions of UDP share: all datagrams that are there are read at once."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+
+    def receive(self, timeout_s: float) -> list[tuple[bytes, tuple[str, int]]]:
+        found: list[tuple[bytes, tuple[str, int]]] = []
+        if _wait([self.socket], timeout_s):
+            try:
+                while len(found) < 256:
+                    found.append(self.socket.recvfrom(CHUNK))
+            except BlockingIOError:
+                return found
+            except ConnectionRefusedError:  # nobody listens there yet
+                return found
+        return found
+
+    def send(self, data: bytes, address: tuple[str, int]) -> None:
+        try:
+            self.socket.sendto(data, address)
+        except (BlockingIOError, ConnectionRefusedError):
+            return  # a full buffer, or nobody listens there yet: a datagram is lost, as datagrams may be
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+class _UdpIn(_Udp):
+    def __init__(self, address: tuple[str, int]) -> None:
+        super().__init__()
+        self._peers: dict[tuple[str, int], float] = {}  # when each was last heard, monotonic [s]
+        try:
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self.socket.bind(address)
+        except OSError:
+            self.close()
+            raise
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        received = self.receive(timeout_s)
+        now = time.monotonic()
+        for _, peer in received:
+            if peer in self._peers or len(self._peers) < MOST_PEERS:
+                self._peers[peer] = now
+        return [data for data, _ in received]
+
+    def write(self, data: bytes) -> None:
+        now = time.monotonic()
+        self._peers = {peer: heard for peer, heard in self._peers.items() if now - heard < FORGET_S}
+        for peer in self._peers:
+            self.send(data, peer)
+
+
+class _UdpOut(_Udp):
+    def __init__(self, address: tuple[str, int], *, broadcast: bool = False) -> None:
+        super().__init__()
+        try:
+            self._address = (socket.gethostbyname(address[0]), address[1])
+            if broadcast:
+                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        except OSError:
+            self.close()
+            raise
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        return [data for data, _ in self.receive(timeout_s)]
+
+    def write(self, data: bytes) -> None:
+        self.send(data, self._address)
+
+
+class _Stream:
+    """A connected stream socket."""
+
+    def __init__(self, connected: socket.socket) -> None:
+        self.socket = connected
+        connected.setblocking(False)
+        if connected.family != socket.AF_UNIX:
+            connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        if not _wait([self.socket], timeout_s):
+            return []
+        data = self.socket.recv(CHUNK)
+        if not data:
+            raise EOFError("closed by the peer")
+        return [data]
+
+    def write(self, data: bytes) -> None:
+        try:
+            self.socket.send(data)
+        except BlockingIOError:
+            return  # the peer does not read: what we have to say will be said again
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+class _TcpIn:
+    """A listening socket and its latest peer. A peer that goes is waited for; only the listener's loss is a loss."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._listener = socket.create_server(address, backlog=1)
+        self._listener.setblocking(False)
+        self._peer: _Stream | None = None
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        peer = self._peer
+        ready = _wait([self._listener, *([peer.socket] if peer else [])], timeout_s)
+        if self._listener in ready:
+            self._drop()
+            self._peer = _Stream(self._listener.accept()[0])
+            return []
+        if not ready or peer is None:
+            return []
+        try:
+            return peer.read(0)
+        except (OSError, EOFError):
+            self._drop()
+            return []
+
+    def write(self, data: bytes) -> None:
+        if self._peer:
+            try:
+                self._peer.write(data)
+            except OSError:
+                self._drop()
+
+    def _drop(self) -> None:
+        if self._peer:
+            self._peer.close()
+            self._peer = None
+
+    def close(self) -> None:
+        self._drop()
+        self._listener.close()
+
+
+class _Serial:
+    def __init__(self, device: str, baud: int) -> None:
+        self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+
+    def read(self, timeout_s: float) -> list[bytes]:
+        ready, _, _ = select.select([self._port], [], [], timeout_s)
+        if not ready:
+            return []
+        data = bytes(self._port.read(CHUNK))
+        if not data:
+            raise EOFError("the device is gone")
+        return [data]
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except serial.SerialTimeoutException:
+            return  # the line is slow: what we have to say will be said again
+
+    def close(self) -> None:
+        self._port.close()
+
+
+_BY_ADDRESS: dict[str, Callable[[tuple[str, int]], Transport]] = {
+    "udpin": _UdpIn,
+    "udp": _UdpIn,
+    "udpout": _UdpOut,
+    "udpbcast": lambda address: _UdpOut(address, broadcast=True),
+    "tcp": lambda address: _Stream(socket.create_connection(address, CONNECT_TIMEOUT_S)),
+    "tcpin": _TcpIn,
+}
