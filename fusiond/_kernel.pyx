@@ -108,8 +108,8 @@ cdef double GRAVITATIONAL_CONSTANT = 3.986004418e14
 cdef double EQUATOR_GRAVITY = 9.7803253359
 cdef double SOMIGLIANA = 0.00193185265241
 cdef double GRAVITY_RATIO = _GRAVITY_RATIO
-cdef double COAST_ACCEL2 = strapdown.COAST_ACCEL ** 2
-cdef double COAST_RATE2 = strapdown.COAST_RATE ** 2
+cdef double COAST_ACCEL2 = strapdown.COAST_ACCEL * strapdown.COAST_ACCEL
+cdef double COAST_RATE2 = strapdown.COAST_RATE * strapdown.COAST_RATE
 cdef double LONGEST_STEP = strapdown.LONGEST_STEP
 cdef double MEAN_TIME = motion.MEAN_TIME
 cdef double MEAN_FILLED = motion.MEAN_FILLED
@@ -832,8 +832,8 @@ cdef class Kernel:
         self.standstill = plan.motion.standstill
         self.non_holonomic = plan.motion.non_holonomic
         self.still_wheel = plan.motion.still_wheel_mps
-        self.still_gyro2 = plan.still_gyro ** 2
-        self.still_accel2 = plan.motion.still_accel_mps2 ** 2
+        self.still_gyro2 = plan.still_gyro * plan.still_gyro
+        self.still_accel2 = plan.motion.still_accel_mps2 * plan.motion.still_accel_mps2
         self.zero_velocity_factor = plan.zero_velocity_factor
         self.numbers_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
 
@@ -981,7 +981,11 @@ cdef class Kernel:
 
     cdef void step(self, Row* rows, Py_ssize_t index, Row* imu, Py_ssize_t whole_size) noexcept nogil:
         cdef Row* row = rows + index
-        row.ratio = 0.0
+        cdef int a
+        row.ratio = 0.0  # all of an earlier run
+        for a in range(3):
+            row.innovation[a] = 0.0
+            row.variance[a] = 0.0
         if self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] == row.t_ns:
             row.outcome = DUPLICATE
             return
@@ -1112,19 +1116,20 @@ cdef class Kernel:
                 seen.jacobian[i * n + VELOCITY + i] = 1.0
                 seen.innovation[i] = -self.x[VELOCITY_E + i]
                 seen.variance[i] = self.constraints[1, 0]
-            self.apply(1, &seen, self.zero_velocity_factor)
-            matrix(self.x + QUATERNION_EB, c)
-            memset(seen.jacobian, 0, 3 * n * sizeof(double))
-            for i in range(3):
-                seen.jacobian[i * n + GYRO_BIAS + i] = 1.0
-                # mat_eb' @ skew(earth rate along z)
-                seen.jacobian[i * n + ATTITUDE] = c[3 + i] * EARTH_RATE
-                seen.jacobian[i * n + ATTITUDE + 1] = -(c[i] * EARTH_RATE)
-                seen.innovation[i] = (
-                    self.auxiliary[RATE_B + i] - self.x[GYRO_BIAS_B + i] - c[6 + i] * EARTH_RATE)
-                seen.variance[i] = self.constraints[2, 0]
-            self.apply(2, &seen, 1.0)
-        elif self.non_holonomic:
+            if self.apply(1, &seen, self.zero_velocity_factor):  # rejected: it is a quiet drive
+                matrix(self.x + QUATERNION_EB, c)
+                memset(seen.jacobian, 0, 3 * n * sizeof(double))
+                for i in range(3):
+                    seen.jacobian[i * n + GYRO_BIAS + i] = 1.0
+                    # mat_eb' @ skew(earth rate along z)
+                    seen.jacobian[i * n + ATTITUDE] = c[3 + i] * EARTH_RATE
+                    seen.jacobian[i * n + ATTITUDE + 1] = -(c[i] * EARTH_RATE)
+                    seen.innovation[i] = (
+                        self.auxiliary[RATE_B + i] - self.x[GYRO_BIAS_B + i] - c[6 + i] * EARTH_RATE)
+                    seen.variance[i] = self.constraints[2, 0]
+                self.apply(2, &seen, 1.0)
+                return
+        if self.non_holonomic:
             parameter = &self.constraints[0, 0]
             point_velocity(self.x, self.auxiliary, parameter, 1, 3, v, by)
             if fabs(v[0]) < parameter[5]:
@@ -1136,10 +1141,11 @@ cdef class Kernel:
                 seen.variance[i] = parameter[3 + i]
             self.apply(0, &seen, 1.0)
 
-    cdef void apply(self, int which, Observation* seen, double factor) noexcept nogil:
+    cdef bint apply(self, int which, Observation* seen, double factor) noexcept nogil:
         cdef double ratio = update(self.x, self.p, seen, self.gates[seen.m], factor, NULL)
         self.auxiliary[CONSTRAINT_RATIO + which] = ratio
         self.stamps[(CONSTRAINT_FUSED if ratio <= 1 else CONSTRAINT_REJECTED) + which] += 1
+        return ratio <= 1
 
     cdef void measure(self, Row* row) noexcept nogil:
         cdef int model = self.models[row.source], a
@@ -1162,9 +1168,6 @@ cdef class Kernel:
                 interval = 1e-6
             alike = exponential(-interval / correlation)
             factor = (1 + alike) / (1 - alike)
-        for a in range(3):
-            row.innovation[a] = 0.0
-            row.variance[a] = 0.0
         for a in range(seen.m):
             row.innovation[a] = seen.innovation[a]
         ratio = update(self.x, self.p, &seen, self.gates[seen.m], factor, row.variance)

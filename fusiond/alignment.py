@@ -12,12 +12,12 @@ import math
 import numpy as np
 
 from fusiond.earth import Array, geodetic_trig, mat_ne_from_trig
-from fusiond.elementary import atan2, sin_cos
+from fusiond.elementary import atan2, sin_cos, square
 from fusiond.motion import MEAN_FILLED, ZERO_VELOCITY, watch
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed, zero_velocity
 from fusiond.observe.model import LEVER_ARM_B
 from fusiond.plan import IMU, MODEL, SECOND, Plan
-from fusiond.rotation import matrix_from_euler, quaternion
+from fusiond.rotation import matrix_from_euler, product, quaternion
 from fusiond.state import (
     ACCEL_BIAS,
     ALIGNING,
@@ -86,7 +86,8 @@ def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan
         stamps[T_IMU] = t_ns
         auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = force_b
         auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = rate_b
-        if stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= plan.still_after_ns:
+        still = stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= plan.still_after_ns
+        if still and not _gnss_speed(state) >= plan.filter.course_speed_mps:  # a quiet drive without wheels
             auxiliary[REST_RATE_B] = auxiliary[MEAN_RATE_B]
             stamps[T_REST] = t_ns
     elif model == MODEL["wheel_speed"]:
@@ -95,12 +96,13 @@ def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan
         auxiliary[FIX_E] = values[gnss_position.PLACE_E]
         auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
         stamps[T_FIX] = t_ns
-        if plan.filter.heading_deg is not None and _leveled(state):
-            variance = (plan.filter.v_max_mps / 3) ** 2
-            if stamps[T_STILL] != NEVER:
+        speed = _gnss_speed(state)  # above the least speed of a course, the GNSS velocity starts the filter
+        if plan.filter.heading_deg is not None and _leveled(state) and not speed >= plan.filter.course_speed_mps:
+            variance = square(plan.filter.v_max_mps / 3)
+            if stamps[T_STILL] != NEVER and (plan.wheels or not math.isnan(speed)):
                 variance = plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE]
             heading, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
-            _start(state, source, np.zeros(3), variance, (heading, sigma), plan)
+            _start(state, source, None, variance, (heading, sigma), plan)
     elif model == MODEL["gnss_velocity"]:
         _gather_velocity(state, source, values, plan)
 
@@ -113,16 +115,25 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
         auxiliary[FIRST_VELOCITY_N] = velocity_n
         stamps[T_FIRST_VELOCITY] = stamps[T]
         return
-    speed = math.sqrt(velocity_n[0] ** 2 + velocity_n[1] ** 2)
+    speed = math.sqrt(square(velocity_n[0]) + square(velocity_n[1]))
     fresh = stamps[T_FIX] != NEVER and stamps[T] - stamps[T_FIX] <= FIX_FRESH_NS
     if window < WINDOW_LEAST_NS or speed < plan.filter.course_speed_mps or not fresh or not _leveled(state):
         return
     course = atan2(velocity_n[1], velocity_n[0])
     variance = values[gnss_velocity.VARIANCE]
-    sigma = math.sqrt(variance / speed**2 + COURSE_SIGMA**2)
+    sigma = math.sqrt(variance / square(speed) + square(COURSE_SIGMA))
     if plan.filter.heading_deg is not None:
         course, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
     _start(state, source, velocity_n, variance, (course, sigma), plan)
+
+
+def _gnss_speed(state: FilterState) -> float:
+    """Horizontal speed [m/s] at the begin of the alignment window; nan where no GNSS velocity came of late."""
+    first = state.stamps[T_FIRST_VELOCITY]
+    if first == NEVER or state.stamps[T] - first > WINDOW_MOST_NS:
+        return math.nan
+    north, east, _ = state.auxiliary[FIRST_VELOCITY_N]
+    return math.sqrt(square(north) + square(east))
 
 
 def _leveled(state: FilterState) -> bool:
@@ -130,29 +141,36 @@ def _leveled(state: FilterState) -> bool:
 
 
 def _start(
-    state: FilterState, source: int, velocity_n: Array, variance: float, heading: tuple[float, float], plan: Plan
+    state: FilterState,
+    source: int,
+    measured_n: Array | None,
+    variance: float,
+    heading: tuple[float, float],
+    plan: Plan,
 ) -> None:
-    """Make the first state from what was gathered: velocity (3,) [m/s] with its variance, heading and sigma [rad]."""
+    """Make the first state from what was gathered: velocity (3,) [m/s], nothing where it was not measured, with its
+    variance; heading and sigma [rad]."""
     stamps, auxiliary, x = state.stamps, state.auxiliary, state.nominal
     yaw, yaw_sigma = heading
     to_n = mat_ne_from_trig(*geodetic_trig(*(float(c) for c in auxiliary[FIX_E])))
-    mat_nb = matrix_from_euler(*_level(state, velocity_n, yaw), yaw)
+    mat_nb = matrix_from_euler(*_level(state, measured_n, yaw), yaw)
+    velocity_n = np.zeros(3) if measured_n is None else measured_n
     since = (stamps[T] - stamps[T_FIX]) * 1e-9
     lever_b = plan.parameters[source][LEVER_ARM_B]
-    x[POSITION_E] = auxiliary[FIX_E] + to_n.T @ (velocity_n * since - mat_nb @ lever_b)
-    x[VELOCITY_E] = to_n.T @ velocity_n
-    x[QUATERNION_EB] = quaternion(to_n.T @ mat_nb)
+    x[POSITION_E] = auxiliary[FIX_E] + product(to_n.T, velocity_n * since - product(mat_nb, lever_b))
+    x[VELOCITY_E] = product(to_n.T, velocity_n)
+    x[QUATERNION_EB] = quaternion(product(to_n.T, mat_nb))
     rest = stamps[T_REST] != NEVER and stamps[T] - stamps[T_REST] <= REST_FRESH_NS
     if rest:
         x[GYRO_BIAS_B] = auxiliary[REST_RATE_B]
     horizontal, vertical = auxiliary[FIX_VARIANCE]
-    level = math.radians(plan.filter.level_sigma_deg) ** 2
+    level = square(math.radians(plan.filter.level_sigma_deg))
     covariance = state.covariance
     covariance[:] = 0.0
     aged = variance * since * since
-    covariance[POSITION, POSITION] = to_n.T @ np.diag([horizontal + aged, horizontal + aged, vertical + aged]) @ to_n
+    covariance[POSITION, POSITION] = product(to_n.T * [horizontal + aged, horizontal + aged, vertical + aged], to_n)
     covariance[VELOCITY, VELOCITY] = np.eye(3) * variance
-    covariance[ATTITUDE, ATTITUDE] = to_n.T @ np.diag([level, level, yaw_sigma**2]) @ to_n
+    covariance[ATTITUDE, ATTITUDE] = product(to_n.T * [level, level, square(yaw_sigma)], to_n)
     for block, sigma in (
         (GYRO_BIAS, min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma),
         (ACCEL_BIAS, plan.imu.accel_bias_sigma),
@@ -160,18 +178,18 @@ def _start(
         (MOUNT_ERROR, math.radians(plan.filter.mount_sigma_deg)),
     ):
         for i in range(block.start, block.stop):
-            covariance[i, i] = sigma**2
+            covariance[i, i] = square(sigma)
     stamps[[T_START, T_CONSTRAINT, T_POSITION]] = stamps[T]
     stamps[PHASE] = RUNNING
 
 
-def _level(state: FilterState, velocity_n: Array, yaw: float) -> tuple[float, float]:
+def _level(state: FilterState, velocity_n: Array | None, yaw: float) -> tuple[float, float]:
     """Roll and pitch [rad] at which the mean specific force is gravity's reaction and the vehicle's own acceleration."""
     force = state.auxiliary[MEAN_FORCE_B].copy()
-    window = (state.stamps[T] - state.stamps[T_FIRST_VELOCITY]) * 1e-9
-    if state.stamps[T_STILL] == NEVER and state.stamps[T_FIRST_VELOCITY] != NEVER and window > 0:
+    if velocity_n is not None and state.stamps[T_STILL] == NEVER:
+        window = (state.stamps[T] - state.stamps[T_FIRST_VELOCITY]) * 1e-9
         north, east, _ = (velocity_n - state.auxiliary[FIRST_VELOCITY_N]) / window
         sine, cosine = sin_cos(yaw)
         force[0] -= cosine * north + sine * east
         force[1] -= cosine * east - sine * north
-    return atan2(-force[1], -force[2]), atan2(force[0], math.sqrt(force[1] ** 2 + force[2] ** 2))
+    return atan2(-force[1], -force[2]), atan2(force[0], math.sqrt(square(force[1]) + square(force[2])))

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.elementary import atan2, sin_cos
+from fusiond.elementary import atan2, sin_cos, square
 
 Array = NDArray[np.float64]
 
@@ -24,12 +24,12 @@ EARTH_RATE = 7.292115e-5  # rad/s
 GRAVITATIONAL_CONSTANT = 3.986004418e14  # m^3/s^2
 EQUATOR_GRAVITY = 9.7803253359  # m/s^2
 SOMIGLIANA = 0.00193185265241
-GRAVITY_RATIO = EARTH_RATE**2 * SEMI_MAJOR**2 * SEMI_MINOR / GRAVITATIONAL_CONSTANT
+GRAVITY_RATIO = square(EARTH_RATE) * square(SEMI_MAJOR) * SEMI_MINOR / GRAVITATIONAL_CONSTANT
 
 
 def radii(latitude: float) -> tuple[float, float]:
     """Radii of curvature (meridian, transverse) [m] at a geodetic latitude [rad]."""
-    w2 = 1 - ECCENTRICITY2 * sin_cos(latitude)[0] ** 2
+    w2 = 1 - ECCENTRICITY2 * square(sin_cos(latitude)[0])
     transverse = SEMI_MAJOR / math.sqrt(w2)
     return transverse * (1 - ECCENTRICITY2) / w2, transverse
 

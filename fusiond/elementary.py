@@ -1,4 +1,4 @@
-"""Sine, cosine, arc tangent and exponential in plain IEEE arithmetic.
+"""Square, sine, cosine, arc tangent and exponential in plain IEEE arithmetic.
 
 The C library picks its variants by the processor (with or without fused multiply-add), so its last bit is not the same
 everywhere. These are: the same operations in the same order give the same bits on every machine, here and in the
@@ -25,6 +25,11 @@ ATAN = (
     -3.65315727442169155270e-02,
     1.62858201153657823623e-02,
 )
+
+
+def square(x: float) -> float:
+    """x * x, which is rounded once; x**2 is the C library's power."""
+    return x * x
 
 
 def sin_cos(x: float) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from fusiond.kernel import Outcome
 from fusiond.measurements import GnssPosition, ImuSample, Invalid, Measurement, Received, WheelSpeed
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
 from fusiond.plan import SECOND, nanoseconds, plan
-from fusiond.rotation import matrix, quaternion
+from fusiond.rotation import matrix, product, quaternion
 from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
@@ -29,6 +29,7 @@ from fusiond.state import (
     MOUNT_ERROR,
     NEVER,
     PHASE,
+    POSITION,
     POSITION_E,
     QUATERNION_EB,
     RATE_B,
@@ -37,6 +38,7 @@ from fusiond.state import (
     SCALE,
     T_IMU,
     T_POSITION,
+    VELOCITY,
     VELOCITY_E,
     WHEEL_SCALE,
     FilterState,
@@ -174,21 +176,23 @@ def state_estimate(state: FilterState) -> StateEstimate:
     x, covariance = state.nominal, state.covariance
     latitude, longitude, height = geodetic(x[POSITION_E])
     to_n = mat_ne(x[POSITION_E])
-    turn = np.kron(np.eye(3), to_n)
+    turn = np.zeros((ATTITUDE.stop, ATTITUDE.stop))
+    for block in (POSITION, VELOCITY, ATTITUDE):
+        turn[block, block] = to_n
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return StateEstimate(
         latitude=latitude,
         longitude=longitude,
         height=height,
-        velocity_n=_three(to_n @ x[VELOCITY_E]),
-        quaternion_nb=tuple(float(c) for c in quaternion(to_n @ matrix(x[QUATERNION_EB]))),  # type: ignore[arg-type]
+        velocity_n=_three(product(to_n, x[VELOCITY_E])),
+        quaternion_nb=tuple(float(c) for c in quaternion(product(to_n, matrix(x[QUATERNION_EB])))),  # type: ignore[arg-type]
         angular_rate_b=_three(state.auxiliary[RATE_B] - x[GYRO_BIAS_B]),
         acceleration_b=_three(state.auxiliary[FORCE_B] - x[ACCEL_BIAS_B]),
         gyro_bias=_three(x[GYRO_BIAS_B]),
         accel_bias=_three(x[ACCEL_BIAS_B]),
         wheel_scale=float(x[WHEEL_SCALE.start]),
         mount=(float(x[MOUNT][0]), float(x[MOUNT][1])),
-        covariance=turn @ covariance[: ATTITUDE.stop, : ATTITUDE.stop] @ turn.T,
+        covariance=product(product(turn, covariance[: ATTITUDE.stop, : ATTITUDE.stop]), turn.T),
         sigma_gyro_bias=_three(sigma[GYRO_BIAS]),
         sigma_accel_bias=_three(sigma[ACCEL_BIAS]),
         sigma_wheel_scale=float(sigma[SCALE.start]),

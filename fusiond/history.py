@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.kernel import ROW, Outcome, Rows, keep, make_kernel, run_one, settles
+from fusiond.kernel import ROW, Outcome, Rows, keep, make_kernel, run_one
 from fusiond.measurements import Measurement
 from fusiond.plan import IMU, Plan
 from fusiond.state import NEVER, FilterState
@@ -102,15 +102,10 @@ class History:
         return outcome
 
     def settled(self) -> FilterState:
-        """The newest state before the horizon that no event still to come can change."""
-        rows, limit = self.rows.copy(), self.settled_ns
-        applied, state = self._snapshots.first()
-        settled, counts = state.copy(), self.counts.copy()
-        while applied < self._applied and rows[applied]["t_ns"] < limit:
-            applied = run_one(state, rows, applied, counts, self.plan)
-            if settles(state, int(rows[applied - 1]["source"]), self.plan):
-                settled.copy_from(state)
-        return settled
+        """The newest snapshot that no event still to come can change: the state about a snapshot interval before the
+        horizon."""
+        self._forget()
+        return self._snapshots.first()
 
     def _rewind(self, first_changed: int) -> None:
         """Restore the head from the newest snapshot that holds no changed row."""
@@ -167,11 +162,11 @@ class Snapshots:
         self.numbers[0], self.whole[0] = empty.numbers, empty.whole
         self.begin, self.end = 0, 1
 
-    def first(self) -> tuple[int, FilterState]:
-        """The base: rows applied, and a copy of the state."""
+    def first(self) -> FilterState:
+        """A copy of the base."""
         state = self._empty.copy()
         state.numbers[:], state.whole[:] = self.numbers[self.begin], self.whole[self.begin]
-        return int(self.applied[self.begin]), state
+        return state
 
     def make_room(self) -> None:
         """Move the snapshots to the front of the memory, or of a larger one if they fill half of it."""

@@ -225,7 +225,7 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
     event at or after it, or len(rows)."""
     row = rows[index]
     t_ns, source, values = int(row["t_ns"]), int(row["source"]), row["values"]
-    row["ratio"] = 0.0
+    row["ratio"], row["innovation"], row["variance"] = 0.0, 0.0, 0.0  # of an earlier run
     if state.source_stamps[source, T_LAST] == t_ns:
         row["outcome"] = Outcome.DUPLICATE
         return
@@ -309,7 +309,6 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     correlation = row["values"][wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION]
     factor = correlation_factor(interval, correlation)
     m = len(seen.innovation)
-    row["innovation"], row["variance"] = 0.0, 0.0
     row["innovation"][:m] = seen.innovation
     row["variance"][:m] = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian) + seen.variance
     ratio, fused = update(state, seen, plan.gates[m], factor)

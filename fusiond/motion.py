@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fusiond.earth import Array
-from fusiond.elementary import exp
+from fusiond.elementary import exp, square
 from fusiond.observe import CONSTRAINTS
 from fusiond.plan import SECOND, Plan
 from fusiond.state import (
@@ -59,9 +59,9 @@ def stands(state: FilterState, plan: Plan) -> bool:
     motion, auxiliary = plan.motion, state.auxiliary
     if not motion.standstill or auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
         return False
-    if auxiliary[SCATTER_FORCE] > motion.still_accel_mps2**2:
+    if auxiliary[SCATTER_FORCE] > square(motion.still_accel_mps2):
         return False
-    if auxiliary[SCATTER_RATE] > plan.still_gyro**2:
+    if auxiliary[SCATTER_RATE] > square(plan.still_gyro):
         return False
     fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
     if plan.wheels and not fresh:
@@ -75,19 +75,21 @@ def constrain(state: FilterState, plan: Plan) -> None:
     if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
         return
     state.stamps[T_CONSTRAINT] = now
-    if state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns:
-        _apply(state, ZERO_VELOCITY, plan, plan.zero_velocity_factor)
+    still = state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns
+    if still and _apply(state, ZERO_VELOCITY, plan, plan.zero_velocity_factor):  # rejected: it is a quiet drive
         _apply(state, ZERO_ROTATION, plan)
     elif plan.motion.non_holonomic:
         _apply(state, NON_HOLONOMIC, plan)
 
 
-def _apply(state: FilterState, which: int, plan: Plan, factor: float = 1.0) -> None:
+def _apply(state: FilterState, which: int, plan: Plan, factor: float = 1.0) -> bool:
+    """Fuse one constraint; whether it passed the gate."""
     parameters = plan.constraints[which]
     seen = CONSTRAINTS[which].observe(state, parameters, parameters)
     if seen is None:
-        return
+        return False
     ratio, fused = update(state, seen, plan.gates[len(seen.innovation)], factor)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     counts = CONSTRAINT_FUSED if fused else CONSTRAINT_REJECTED
     state.stamps[counts.start + which] += 1
+    return fused

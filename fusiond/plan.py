@@ -9,6 +9,7 @@ import numpy as np
 
 from fusiond.config import Config, Filter, Imu, Motion
 from fusiond.earth import Array
+from fusiond.elementary import square
 from fusiond.observe import (
     MODELS,
     gnss_position,
@@ -84,12 +85,12 @@ def plan(config: Config) -> Plan:
         ),
         gates=(math.inf, *(chi_square(settings.gate_probability, freedom) for freedom in (1, 2, 3))),
         noise=ProcessNoise(
-            accel=imu.accel_noise**2,
-            gyro=imu.gyro_noise**2,
-            accel_bias=imu.accel_bias_walk**2,
-            gyro_bias=imu.gyro_bias_walk**2,
-            scale=settings.wheel_scale_walk**2 if settings.wheel_scale_sigma else 0.0,
-            mount=math.radians(settings.mount_walk_deg) ** 2 if settings.mount_sigma_deg else 0.0,
+            accel=square(imu.accel_noise),
+            gyro=square(imu.gyro_noise),
+            accel_bias=square(imu.accel_bias_walk),
+            gyro_bias=square(imu.gyro_bias_walk),
+            scale=square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0,
+            mount=square(math.radians(settings.mount_walk_deg)) if settings.mount_sigma_deg else 0.0,
         ),
         wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
         horizon_ns=nanoseconds(settings.horizon_s),

@@ -13,6 +13,14 @@ from fusiond.earth import Array
 from fusiond.elementary import asin, atan2, sin_cos
 
 
+def product(left: Array, right: Array) -> Array:
+    """Matrix product (n, m) of (n, k) and (k, m), or (n,) of (n, k) and (k,), in plain IEEE arithmetic: `@` leaves it to a
+    library that is not the same on every processor."""
+    terms: Array = left[:, :, None] * right[None] if right.ndim == 2 else left * right
+    summed: Array = terms.sum(axis=1)
+    return summed
+
+
 def skew(v: Array) -> Array:
     """The matrix (3, 3) with skew(v) @ u = v x u."""
     x, y, z = v

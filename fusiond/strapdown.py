@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.earth import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array, gravity_e
+from fusiond.elementary import square
 from fusiond.rotation import matrix, normalised, quaternion_exp, quaternion_multiply, skew
 from fusiond.state import (
     ACCEL_BIAS,
@@ -131,4 +132,4 @@ def coast(state: FilterState, dt: float, noise: ProcessNoise) -> None:
     x[POSITION_E] += x[VELOCITY_E] * dt
     phi = np.eye(state.size)
     phi[POSITION, VELOCITY] = np.eye(3) * dt
-    _grow(state, phi, dt, COAST_ACCEL**2, COAST_RATE**2, noise)
+    _grow(state, phi, dt, square(COAST_ACCEL), square(COAST_RATE), noise)

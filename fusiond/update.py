@@ -40,21 +40,20 @@ ADDED = (
 
 def chi_square(probability: float, freedom: int) -> float:
     """The value that a chi-square variable of `freedom` degrees stays below with `probability` (bisection on its
-    distribution function, Abramowitz and Stegun 26.4.4, 26.4.5 and 26.4.8)."""
+    distribution function, Abramowitz and Stegun 26.4.6, in arithmetic that is the same on every machine)."""
 
     def distribution(x: float) -> float:
-        if freedom % 2:
-            value, term, k = math.erf(math.sqrt(x / 2)), math.sqrt(2 * x / math.pi) * math.exp(-x / 2), 1
-        else:
-            value, term, k = 1 - math.exp(-x / 2), x / 2 * math.exp(-x / 2), 2
-        while k < freedom:
-            value -= term
+        term, k = (math.sqrt(2 * x / math.pi), 1) if freedom % 2 else (x / 2, 2)  # (x/2)^(k/2) / Gamma(k/2 + 1)
+        total = 0.0
+        while k <= freedom or term > 1e-17 * total:
+            if k >= freedom:
+                total += term
             k += 2
             term *= x / k
-        return value
+        return total * exp(-x / 2)
 
     low, high = 0.0, 1.0
-    while distribution(high) < probability:
+    while distribution(high) < probability and high < 1000:
         high *= 2
     for _ in range(200):
         middle = (low + high) / 2

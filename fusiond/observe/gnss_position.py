@@ -6,6 +6,7 @@ import numpy as np
 
 from fusiond.config import Gnss
 from fusiond.earth import Array, ecef, mat_ne
+from fusiond.elementary import square
 from fusiond.measurements import GnssPosition
 from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, mat_eb
 from fusiond.rotation import skew
@@ -27,7 +28,7 @@ def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
     but never below the configured one."""
     horizontal = max(fix.sigma_horizontal or 0.0, gnss.position_sigma_m)
     vertical = max(fix.sigma_vertical or 0.0, gnss.height_sigma_m)
-    return (*(float(c) for c in ecef(fix.latitude, fix.longitude, fix.height)), horizontal**2, vertical**2)
+    return (*(float(c) for c in ecef(fix.latitude, fix.longitude, fix.height)), square(horizontal), square(vertical))
 
 
 def observe(state: FilterState, row: Array, parameter: Array) -> Observation:

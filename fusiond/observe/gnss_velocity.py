@@ -6,6 +6,7 @@ import numpy as np
 
 from fusiond.config import Gnss
 from fusiond.earth import Array, mat_ne
+from fusiond.elementary import square
 from fusiond.measurements import GnssVelocity
 from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, mat_eb, rate_b
 from fusiond.rotation import skew
@@ -25,7 +26,7 @@ def parameters(gnss: Gnss) -> Array:
 
 def values(velocity: GnssVelocity, gnss: Gnss) -> tuple[float, ...]:
     """Velocity (3,) north-east-down [m/s], variance per axis, number of axes given."""
-    variance = max(velocity.sigma or 0.0, gnss.velocity_sigma_mps) ** 2
+    variance = square(max(velocity.sigma or 0.0, gnss.velocity_sigma_mps))
     if velocity.down is None:
         return velocity.north, velocity.east, 0.0, variance, 2.0
     return velocity.north, velocity.east, velocity.down, variance, 3.0

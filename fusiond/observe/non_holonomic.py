@@ -7,6 +7,7 @@ import numpy as np
 
 from fusiond.config import Motion
 from fusiond.earth import Array
+from fusiond.elementary import square
 from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
 from fusiond.state import FilterState
 
@@ -17,8 +18,8 @@ LEAST_SPEED = 5  # m/s, parameters
 def parameters(motion: Motion) -> Array:
     row = np.zeros(PARAMETERS)
     row[LEVER_ARM_B] = motion.point_m
-    row[LATERAL_VARIANCE] = motion.lateral_sigma_mps**2
-    row[VERTICAL_VARIANCE] = motion.vertical_sigma_mps**2
+    row[LATERAL_VARIANCE] = square(motion.lateral_sigma_mps)
+    row[VERTICAL_VARIANCE] = square(motion.vertical_sigma_mps)
     row[LEAST_SPEED] = motion.minimum_speed_mps
     return row
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from fusiond.config import Wheel
 from fusiond.earth import Array
-from fusiond.elementary import exp
+from fusiond.elementary import exp, square
 from fusiond.measurements import WheelSpeed
 from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
 from fusiond.state import SCALE, WHEEL_SCALE, FilterState
@@ -36,9 +36,9 @@ def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     """Speed [m/s], its variance (the white noise and that of rounding to a quantum, quantum^2/12), and the time over which
     its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the same
     from reading to reading."""
-    variance, alike = wheel.sigma_mps**2 + wheel.quantum_mps**2 / 12, wheel.correlation_s
+    variance, alike = square(wheel.sigma_mps) + square(wheel.quantum_mps) / 12, wheel.correlation_s
     if abs(reading.speed) < wheel.least_mps:
-        return reading.speed, variance + wheel.least_mps**2 / 3, max(alike, SLOW_ALIKE)
+        return reading.speed, variance + square(wheel.least_mps) / 3, max(alike, SLOW_ALIKE)
     return reading.speed, variance, alike
 
 

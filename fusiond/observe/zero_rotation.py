@@ -8,6 +8,7 @@ import numpy as np
 
 from fusiond.config import Motion
 from fusiond.earth import Array
+from fusiond.elementary import square
 from fusiond.observe.model import PARAMETERS, Observation, mat_eb
 from fusiond.rotation import skew
 from fusiond.state import ATTITUDE, GYRO_BIAS, GYRO_BIAS_B, RATE_B, FilterState
@@ -18,7 +19,7 @@ VARIANCE = 0  # (rad/s)^2, parameters
 
 def parameters(motion: Motion) -> Array:
     row = np.zeros(PARAMETERS)
-    row[VARIANCE] = math.radians(motion.zero_rotation_sigma_deg_s) ** 2
+    row[VARIANCE] = square(math.radians(motion.zero_rotation_sigma_deg_s))
     return row
 
 

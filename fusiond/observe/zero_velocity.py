@@ -7,6 +7,7 @@ import numpy as np
 
 from fusiond.config import Motion
 from fusiond.earth import Array
+from fusiond.elementary import square
 from fusiond.observe.model import PARAMETERS, Observation
 from fusiond.state import VELOCITY, VELOCITY_E, FilterState
 
@@ -15,7 +16,7 @@ VARIANCE = 0  # (m/s)^2, parameters
 
 def parameters(motion: Motion) -> Array:
     row = np.zeros(PARAMETERS)
-    row[VARIANCE] = motion.zero_velocity_sigma_mps**2 + motion.still_wheel_mps**2 / 3
+    row[VARIANCE] = square(motion.zero_velocity_sigma_mps) + square(motion.still_wheel_mps) / 3
     return row
 
 

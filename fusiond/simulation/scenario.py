@@ -27,19 +27,19 @@ RAW_MAX_UNSIGNED, RAW_MAX_SIGNED = 32767, 16383  # of a 15-bit wheel signal
 class Start(Section, frozen=True, kw_only=True):
     """[start]: where and when the drive begins, and how fast."""
 
-    latitude_deg: Annotated[float, Meta(ge=-89.9, le=89.9)] = 48.137
-    longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = 11.575
+    latitude_deg: Annotated[float, Meta(ge=-89.9, le=89.9)] = 48.137  # WGS-84
+    longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = 11.575  # WGS-84
     height_m: float = 560.0  # above the ellipsoid
     heading_deg: Degrees = 0.0  # clockwise from north
     grade_deg: Annotated[float, Meta(ge=-30, le=30)] = 0.0  # slope of the road, upward positive
     speed_mps: float = 0.0  # negative: backwards
-    time_unix_s: Annotated[float, Meta(ge=0, le=4e9)] = 1_760_000_000.0
+    time_unix_s: Annotated[float, Meta(ge=0, le=4e9)] = 1_760_000_000.0  # Unix time of the start, taken to the millisecond
 
 
 class Segment(Section, frozen=True, kw_only=True):
     """[[segment]]: a piece of the drive; speed, heading and slope pass smoothly to the values at its end."""
 
-    duration_s: Positive
+    duration_s: Positive  # how long it lasts
     speed_mps: Annotated[float, Meta(ge=-80, le=80)] | None = None  # at the end; default: unchanged
     turn_deg: float = 0.0  # change of heading over the segment, clockwise positive
     grade_deg: Annotated[float, Meta(ge=-30, le=30)] | None = None  # slope of the road at the end; default: unchanged
@@ -48,9 +48,9 @@ class Segment(Section, frozen=True, kw_only=True):
 class Body(Section, frozen=True, kw_only=True):
     """[vehicle]"""
 
-    name: Name = "simulated"
-    wheelbase_m: Positive = 2.7
-    track_m: Positive = 1.55
+    name: Name = "simulated"  # names the vehicle in the configuration that is written
+    wheelbase_m: Positive = 2.7  # front axle to rear axle
+    track_m: Positive = 1.55  # left wheels to right wheels
     roll_deg_per_mps2: float = 0.4  # lean of the body out of a bend, per lateral acceleration
 
 
@@ -66,7 +66,7 @@ class Transport(Section, frozen=True, kw_only=True):
 class Reboot(Section, frozen=True, kw_only=True):
     """[[autopilot.reboot]]: the boot clock starts from 0 again."""
 
-    at_s: NotNegative
+    at_s: NotNegative  # when
     silence_s: NotNegative = 3.0  # nothing is sent for so long
 
 
@@ -88,15 +88,15 @@ class Host(Section, frozen=True, kw_only=True):
 class Imu(Section, frozen=True, kw_only=True):
     """[imu]: HIGHRES_IMU; each sample tells of the very instant of its stamp."""
 
-    rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 100.0
-    position_m: Vector = (1.2, 0.0, -0.6)
+    rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 100.0  # samples a second
+    position_m: Vector = (1.2, 0.0, -0.6)  # where it sits
     mount_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of its axes against the vehicle
     accel_noise: NotNegative = 3e-3  # white noise density [m/s^2/sqrt(Hz)]
     gyro_noise: NotNegative = 2e-4  # white noise density [rad/s/sqrt(Hz)]
     accel_bias: Vector | None = None  # first bias [m/s^2]; default: drawn with the sigma below
     gyro_bias: Vector | None = None  # first bias [rad/s]; default: drawn with the sigma below
-    accel_bias_sigma: NotNegative = 0.05  # [m/s^2]
-    gyro_bias_sigma: NotNegative = 2e-3  # [rad/s]
+    accel_bias_sigma: NotNegative = 0.05  # of the first bias, where drawn [m/s^2]
+    gyro_bias_sigma: NotNegative = 2e-3  # of the first bias, where drawn [rad/s]
     accel_bias_walk: NotNegative = 1e-4  # random walk [m/s^2/sqrt(s)]
     gyro_bias_walk: NotNegative = 5e-6  # random walk [rad/s/sqrt(s)]
     accel_resolution: NotNegative = 0.0  # step of the reading [m/s^2]; 0: none
@@ -112,15 +112,15 @@ class Imu(Section, frozen=True, kw_only=True):
 class Jump(Section, frozen=True, kw_only=True):
     """[[gnss.jump]]: multipath; the position is off by a constant."""
 
-    start_s: NotNegative
-    stop_s: NotNegative
+    start_s: NotNegative  # from
+    stop_s: NotNegative  # to
     offset_m: Vector  # north, east, down
 
 
 class Spoof(Section, frozen=True, kw_only=True):
     """[[gnss.spoof]]: position drifts off at a constant rate, and the velocity tells the same story."""
 
-    start_s: NotNegative
+    start_s: NotNegative  # from
     stop_s: NotNegative = math.inf  # back to the truth then
     rate_mps: Vector  # north, east, down
 
@@ -128,15 +128,15 @@ class Spoof(Section, frozen=True, kw_only=True):
 class Gnss(Section, frozen=True, kw_only=True):
     """[gnss]: GPS_RAW_INT."""
 
-    rate_hz: Annotated[float, Meta(gt=0, le=50)] = 5.0
-    antenna_m: Vector = (0.8, 0.0, -1.6)
+    rate_hz: Annotated[float, Meta(gt=0, le=50)] = 5.0  # fixes a second
+    antenna_m: Vector = (0.8, 0.0, -1.6)  # where the antenna sits
     delay_ms: NotNegative = 100.0  # from the instant of the fix to its arrival at the autopilot
     velocity_lag_ms: NotNegative = 0.0  # velocity is a mean over twice this time
     stamp: Literal["unix", "boot-arrival", "none"] = "unix"  # of the fix; boot time of its arrival; 0
     sigma_m: NotNegative = 0.5  # white, horizontal, per axis
-    height_sigma_m: NotNegative = 1.0
+    height_sigma_m: NotNegative = 1.0  # white, vertical
     drift_sigma_m: NotNegative = 0.5  # Gauss-Markov, horizontal, per axis
-    height_drift_sigma_m: NotNegative = 1.0
+    height_drift_sigma_m: NotNegative = 1.0  # Gauss-Markov, vertical
     correlation_s: Positive = 60.0  # of the Gauss-Markov part
     velocity_sigma_mps: NotNegative = 0.08  # white, per axis
     report_accuracy: bool = True  # fill h_acc, v_acc, vel_acc, else 0 = unknown
@@ -152,24 +152,24 @@ class Gnss(Section, frozen=True, kw_only=True):
 class Slip(Section, frozen=True, kw_only=True):
     """[[wheels.slip]]: a wheel turns faster (spin) or slower (lock) than the road passes."""
 
-    wheel: WheelName
-    start_s: NotNegative
-    stop_s: NotNegative
+    wheel: WheelName  # which
+    start_s: NotNegative  # from
+    stop_s: NotNegative  # to
     factor: NotNegative  # reading over true speed
 
 
 class Stuck(Section, frozen=True, kw_only=True):
     """[[wheels.stuck]]: a wheel's reading stays what it was at the start."""
 
-    wheel: WheelName
-    start_s: NotNegative
-    stop_s: NotNegative
+    wheel: WheelName  # which
+    start_s: NotNegative  # from
+    stop_s: NotNegative  # to
 
 
 class Wheels(Section, frozen=True, kw_only=True):
     """[wheels]: one CAN frame with the four wheels' speeds, 15 bits each, a counter and a fault bit."""
 
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0  # frames a second
     scale_error: Annotated[float, Meta(gt=-0.5, lt=0.5)] = 0.0  # every wheel reads so much too fast (0.01 = 1 %)
     scale_errors: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # each wheel's own, in the order of WHEELS
     sigma_mps: NotNegative = 0.02  # white noise of a reading; a standing wheel has none
@@ -188,7 +188,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     """The whole file."""
 
     segment: Annotated[list[Segment], Meta(min_length=1)]
-    seed: Annotated[int, Meta(ge=0)] = 1
+    seed: Annotated[int, Meta(ge=0)] = 1  # same seed, same files
     truth_rate_hz: Positive = 20.0  # rows of truth.csv a second
     start: Start = field(default_factory=Start)
     vehicle: Body = field(default_factory=Body)

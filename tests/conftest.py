@@ -1,0 +1,15 @@
+"""What the tests share: the kernel under test, compiled and in NumPy."""
+
+from __future__ import annotations
+
+import pytest
+
+from fusiond.kernel import compiled_available
+
+needs_compiled = pytest.mark.skipif(not compiled_available(), reason="the compiled kernel was not built")
+
+
+@pytest.fixture(params=[pytest.param(True, id="compiled", marks=needs_compiled), pytest.param(False, id="numpy")])
+def compiled(request: pytest.FixtureRequest) -> bool:
+    """Which kernel to ask for."""
+    return bool(request.param)

@@ -1,0 +1,166 @@
+"""The order of arrival never changes a bit: any shuffle inside the horizon gives the same state, outcomes and counts.
+
+A case is a few seconds of a drive with everything that makes arrival matter: duplicates, outliers at the gate's edge,
+invalid samples, IMU samples that are missing for longer than it may be silent, events stamped after the newest IMU
+sample. It is fused in the order of the stamps, and again in a random order of arrival in which nobody is later than the
+horizon. What is drawn is a seed and the shape of the case; the seed is printed where a case fails.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fusiond.config import Config
+from fusiond.fusion import Fusion
+from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Payload, WheelSpeed
+from fusiond.state import PHASE, RUNNING
+from tests.conftest import needs_compiled
+from tests.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
+
+PREFIX_S, LENGTH_S = 2.0, 2.5  # of a case: in order, so that the filter runs; and shuffled
+QUIET = settings(deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+
+CASES = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 2**32 - 1),
+        "begin_s": st.sampled_from([0.0, 2.0, 9.0, 20.0, 29.0, 33.5, 38.5]),
+        "horizon_s": st.sampled_from([0.3, 0.6, 1.0]),
+        "snapshot_interval_s": st.sampled_from([0.0, 0.01, 0.05, 0.3]),
+        "imu_hole": st.booleans(),
+        "correlation_s": st.sampled_from([0.0, 0.5]),
+    }
+)
+Case = dict[str, float]
+
+
+@cache
+def drive_events() -> tuple[Measurement, ...]:
+    """The whole drive in the order of the stamps: pulls away, weaves, stands, pulls away again."""
+    return tuple(measurements(town(45.0), seed=3))
+
+
+def configuration(case: Case) -> Config:
+    return config(
+        filter={
+            "heading_deg": 40.0,
+            "horizon_s": case["horizon_s"],
+            "snapshot_interval_s": case["snapshot_interval_s"],
+            "imu_gap_s": 0.1,
+            "gnss_reset_s": 0.7,
+        },
+        gnss={"position_correlation_s": case["correlation_s"], "velocity_correlation_s": case["correlation_s"]},
+    )
+
+
+def stretch(case: Case) -> tuple[list[Measurement], list[Measurement]]:
+    """The events of a case in the order of their stamps: before the shuffle, and in it."""
+    begin = T0 + round(case["begin_s"] * SECOND)
+    middle, end = begin + round(PREFIX_S * SECOND), begin + round((PREFIX_S + LENGTH_S) * SECOND)
+    events = [event for event in drive_events() if begin <= event.t_ns < end]
+    prefix = [event for event in events if event.t_ns < middle]
+    return prefix, spoiled([event for event in events if event.t_ns >= middle], case)
+
+
+def spoiled(events: list[Measurement], case: Case) -> list[Measurement]:
+    """With lost IMU samples, outliers, invalid samples and duplicates, all by the case's seed."""
+    random = np.random.default_rng(int(case["seed"]))
+    hole = events[0].t_ns + round(random.uniform(0.2, 1.5) * SECOND)
+    held: list[Measurement] = []
+    for event in events:
+        imu = isinstance(event.payload, ImuSample)
+        if imu and (random.random() < 0.02 or (case["imu_hole"] and hole <= event.t_ns < hole + 250 * MS)):
+            continue
+        chance = random.random()
+        payload: Payload | Invalid = event.payload
+        if chance < 0.1:
+            payload = off(payload, random)
+        elif chance < 0.12:
+            payload = Invalid("fault")
+        held.append(Measurement(event.t_ns, event.source, event.sequence, event.t_receive_ns, payload))
+        if chance > 0.97:  # the very same event once more
+            held.append(held[-1])
+        elif chance > 0.95:  # another event of the source with the same stamp
+            other = off(event.payload, random)
+            held.append(Measurement(event.t_ns, event.source, event.sequence + 10**6, event.t_receive_ns, other))
+    return held
+
+
+def off(payload: Payload | Invalid, random: np.random.Generator) -> Payload | Invalid:
+    """A measurement that is wrong by about as much as the gate lets through."""
+    if isinstance(payload, GnssPosition):
+        return GnssPosition(payload.latitude + random.normal(0, 6.0) / 6.4e6, payload.longitude, payload.height, 1.0, 1.0)
+    if isinstance(payload, GnssVelocity):
+        return GnssVelocity(payload.north + random.normal(0, 0.5), payload.east, None, 0.1)
+    if isinstance(payload, WheelSpeed):
+        return WheelSpeed(payload.speed + random.normal(0, 0.4))
+    return payload
+
+
+def arrival(events: list[Measurement], case: Case) -> list[Measurement]:
+    """The events as they arrive with random delays, none as long as the horizon."""
+    random = np.random.default_rng([int(case["seed"]), 1])
+    longest = (case["horizon_s"] * SECOND - 1) * random.choice([0.2, 1.0])
+    arrivals = [event.t_ns + int(longest * random.random() ** 2) for event in events]
+    return [events[i] for i in np.argsort(arrivals, kind="stable")]
+
+
+def check(case: Case, compiled: bool) -> None:
+    prefix, events = stretch(case)
+    settings_ = configuration(case)
+    in_order = fuse(settings_, prefix + events, compiled)
+    shuffled = fuse(settings_, prefix + arrival(events, case), compiled)
+    assert in_order.history.head.stamps[PHASE] == RUNNING
+    assert sum(in_order.totals().values()) == len(prefix) + len(events)
+    assert in_order.totals()["TOO_OLD"] == 0
+    same_bits(in_order, shuffled)
+
+
+@needs_compiled
+@given(CASES)
+@settings(QUIET, max_examples=1000)
+def test_shuffled_arrivals(case: Case) -> None:
+    check(case, compiled=True)
+
+
+@given(CASES)
+@settings(QUIET, max_examples=2)
+def test_shuffled_arrivals_on_the_twin(case: Case) -> None:
+    check(case, compiled=False)
+
+
+@pytest.mark.slow
+@needs_compiled
+@given(CASES)
+@settings(QUIET, max_examples=20_000)
+def test_shuffled_arrivals_for_long(case: Case) -> None:
+    check(case, compiled=True)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(QUIET, max_examples=8)
+def test_shuffled_while_aligning(seed: int) -> None:
+    """The start itself does not depend on the order of arrival: the first 2.5 s are shuffled."""
+    case: Case = {"seed": seed, "begin_s": 9.0, "horizon_s": 0.6, "snapshot_interval_s": 0.05, "imu_hole": False}
+    events = [event for event in drive_events() if 0 <= event.t_ns - T0 - 9 * SECOND < 2.5 * SECOND]
+    settings_ = configuration(case | {"correlation_s": 0.0})
+    in_order, shuffled = fuse(settings_, events), fuse(settings_, arrival(events, case))
+    assert in_order.history.head.stamps[PHASE] == RUNNING
+    same_bits(in_order, shuffled)
+
+
+@needs_compiled
+@pytest.mark.parametrize("interval_s", [0.01, 0.05, 0.5])
+def test_snapshots_at_any_spacing(interval_s: float) -> None:
+    case: Case = {"seed": 5, "begin_s": 20.0, "horizon_s": 1.0, "imu_hole": True, "correlation_s": 0.5}
+    every: Fusion | None = None
+    for spacing in (0.0, interval_s):
+        prefix, events = stretch(case)
+        fusion = fuse(configuration(case | {"snapshot_interval_s": spacing}), prefix + arrival(events, case), True)
+        if every is not None:
+            same_bits(every, fusion)
+        every = fusion
