@@ -1,0 +1,82 @@
+"""A real drive: accuracy on the captured RAV4 trace, as it is, with arrival stamps, without GNSS, without rewinding."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fusiond import config as configuration
+from fusiond.comparison import TruthReport, Window
+from fusiond.config import Config
+from fusiond.replay import Options, parse_withheld, replay
+
+ROOT = Path(__file__).parents[2]
+DRIVE = ROOT.parent / "shared" / "data" / "comma2k19-rav4"
+CONFIG = ROOT / "configs" / "rav4.toml"
+WINDOW = Window(10.0, 30.0)
+pytestmark = pytest.mark.skipif(not DRIVE.is_dir(), reason="the captured drive comma2k19-rav4 is not beside the project")
+
+
+def car(**gnss: object) -> Config:
+    """The car's configuration, with other values for its receiver."""
+    config = configuration.load(CONFIG)
+    receiver = msgspec.structs.replace(config.gnss["gps0"], **gnss)
+    return msgspec.structs.replace(config, gnss={"gps0": receiver})
+
+
+def errors(
+    config: Config, tlog: str = "drive.tlog", window: Window = WINDOW, withhold: str | None = None, csv: Path | None = None
+) -> TruthReport:
+    summary = replay(
+        Options(
+            config=config,
+            config_name="rav4.toml",
+            logs=[str(DRIVE / tlog), str(DRIVE / "drive.candump.log")],
+            truth=DRIVE / "truth.csv",
+            withheld=[parse_withheld(withhold, config)] if withhold else [],
+            window=window,
+            csv=csv,
+        )
+    )
+    assert summary.truth is not None
+    return summary.truth
+
+
+def test_fixes_at_their_own_time() -> None:
+    found = errors(car())
+    assert found.position.rmse_m <= 0.45
+    assert found.position.rmse_offset_removed_m <= 0.18
+    assert found.velocity_rmse_mps <= 0.10
+    assert found.heading.rmse_deg <= 0.15
+    assert found.position.inside_95 >= 0.95
+
+
+@pytest.mark.parametrize("seconds", ["12-22", "18-28"])
+def test_ten_seconds_without_gnss(seconds: str) -> None:
+    end = float(seconds.partition("-")[2])
+    found = errors(car(), window=Window(end - 1, end), withhold=f"gps0:{seconds}")
+    assert found.position.end_m <= 2.0
+    assert found.position.inside_95 >= 0.95
+
+
+def test_fixes_stamped_at_their_arrival_with_the_delay_given() -> None:
+    own, arrival = errors(car()), errors(car(delay_ms=78.0), "drive-gps-boot-time.tlog")
+    assert arrival.position.rmse_m <= 1.1 * own.position.rmse_m
+    assert arrival.velocity_rmse_mps <= 1.1 * own.velocity_rmse_mps
+    assert arrival.heading.rmse_deg <= 1.1 * own.heading.rmse_deg
+
+
+def test_fusing_each_fix_at_its_arrival_is_clearly_worse() -> None:
+    """Without rewinding: every fix is taken for one of the instant it arrives."""
+    found = errors(car(stamp="arrival", velocity_delay_ms=0.0))
+    assert found.position.rmse_m > 2 * errors(car()).position.rmse_m
+
+
+def test_same_inputs_same_bytes(tmp_path: Path) -> None:
+    for name in ("first.csv", "second.csv"):
+        errors(car(), csv=tmp_path / name)
+    first, second = (tmp_path / name for name in ("first.csv", "second.csv"))
+    assert first.read_bytes() == second.read_bytes()
+    assert len(first.read_text().splitlines()) > 1400

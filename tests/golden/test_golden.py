@@ -1,0 +1,58 @@
+"""The bundled drive gives the published states it gave before, bit for bit; a change of them is on purpose or a fault.
+
+After a change on purpose: `python -m tests.golden.test_golden` writes the new states, and the commit says by how much they
+differ and why that is better.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusiond import config
+from fusiond.demo import DRIVE, LOGS
+from fusiond.kernel import compiled_available
+from fusiond.replay import Options, replay
+
+GOLDEN = Path(__file__).parent / "demo.csv"
+
+
+def states(path: Path) -> str:
+    """Replay the bundled drive; the CSV of one state a second."""
+    replay(
+        Options(
+            config=config.load(DRIVE / "fusiond.toml"),
+            config_name="fusiond.toml",
+            logs=[str(DRIVE / log) for log in LOGS],
+            csv=path,
+            rate_hz=1.0,
+        )
+    )
+    return path.read_text()
+
+
+def test_golden(tmp_path: Path) -> None:
+    found, kept = states(tmp_path / "demo.csv"), GOLDEN.read_text()
+    if compiled_available():
+        assert found == kept
+        return
+    for row, was in zip(csv.DictReader(found.splitlines()), csv.DictReader(kept.splitlines()), strict=True):
+        assert row["mode"] == was["mode"]
+        numbers = [[float(value) for key, value in r.items() if value and key != "mode"] for r in (row, was)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=1e-9, abs=1e-9)
+
+
+def test_the_golden_states_are_those_of_a_drive() -> None:
+    rows = [row for row in csv.DictReader(GOLDEN.read_text().splitlines()) if row["mode"] != "aligning"]
+    assert len(rows) > 120
+    assert {row["mode"] for row in rows} == {"nominal", "dead_reckoning"}
+    assert np.ptp([float(row["lat_deg"]) for row in rows]) > 1e-3
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as folder:
+        GOLDEN.write_text(states(Path(folder) / "demo.csv"))
