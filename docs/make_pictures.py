@@ -1,0 +1,182 @@
+"""Draw the pictures of the documentation into docs/images/: python docs/make_pictures.py (needs the extra `plot`)
+
+The picture of the captured drive needs that drive in ../shared/data, beside the project; without it, it is left out.
+"""
+
+import csv
+import math
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from fusiond import config, demo
+from fusiond.comparison import Truth, Window, displacement, parse_truth
+from fusiond.replay import Options, replay
+from fusiond.report import Summary
+
+ROOT = Path(__file__).parents[1]
+IMAGES = ROOT / "docs" / "images"
+CAR = ROOT / "configs" / "rav4.toml"
+DRIVE = ROOT.parent / "shared" / "data" / "comma2k19-rav4"
+SECONDS = Window(10, 30)
+COLOURS = 96  # of a picture's palette: keeps it small
+BLUE, VERMILION, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#808080"
+
+
+def figure_of(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def shrink(path: Path) -> None:
+    """Write a PNG again with a palette."""
+    with Image.open(path) as picture:
+        small = picture.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+    small.save(path, optimize=True)
+    print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1e3:.0f} kB")
+
+
+# --- The bundled drive
+
+
+def draw_demo() -> None:
+    """The track of the bundled drive, and its errors."""
+    path = IMAGES / "demo.png"
+    settings = config.load(demo.DRIVE / "fusiond.toml")
+    logs = [str(demo.DRIVE / log) for log in demo.LOGS]
+    replay(Options(config=settings, config_name="", logs=logs, truth=demo.DRIVE / "truth.csv.gz", plot=path))
+    shrink(path)
+
+
+# --- A captured drive, each fix at its own time or at its arrival
+
+
+class Errors(NamedTuple):
+    """Of a replay against the reference, one row per publication."""
+
+    second: list[float]
+    along_m: list[float]  # in the direction of travel
+    across_m: list[float]  # to the right of it
+
+
+def draw_arrival() -> None:
+    """What it costs to fuse each fix at its arrival."""
+    if not DRIVE.is_dir():
+        print("arrival.png left out: the captured drive is not beside the project", file=sys.stderr)
+        return
+    text = CAR.read_text(encoding="utf-8")
+    arrival = text.replace("[gnss.gps0]", '[gnss.gps0]\nstamp = "arrival"').replace(
+        "velocity_delay_ms = 55.0", "velocity_delay_ms = 0.0"
+    )
+    runs = (("each fix at its own time", BLUE, text), ("each fix at its arrival", VERMILION, arrival))
+    figure = figure_of(9, 5)
+    axes = figure.subplots(2, 1, sharex=True)
+    for label, colour, settings in runs:
+        summary, errors = fused(settings)
+        assert summary.truth is not None
+        told = f"{label}: {summary.truth.position.rmse_m:.2f} m RMSE"
+        print(f"{told}, {summary.truth.velocity_rmse_mps:.3f} m/s, {100 * summary.truth.position.inside_95:.0f} % inside")
+        axes[0].plot(errors.second, errors.along_m, color=colour, linewidth=1.2, label=told)
+        axes[1].plot(errors.second, errors.across_m, color=colour, linewidth=1.2)
+    for ax, name in zip(axes, ("along the track [m]", "across the track [m]"), strict=True):
+        ax.axhline(0.0, color=GREY, linewidth=0.6)
+        ax.set(ylabel=name, ylim=(-2.6, 1.2))
+        ax.grid(alpha=0.25)
+    axes[0].legend(loc="upper right", ncols=2, frameon=False)
+    axes[0].set_title("Published position less reference, RAV4, seconds 10 to 30", loc="left", fontsize=10)
+    axes[1].set_xlabel("time from the first event [s]")
+    path = IMAGES / "arrival.png"
+    figure.savefig(path)
+    shrink(path)
+
+
+def fused(settings: str) -> tuple[Summary, Errors]:
+    """Replay the captured drive with the text of a configuration."""
+    with tempfile.TemporaryDirectory() as folder:
+        track = Path(folder) / "track.csv"
+        summary = replay(
+            Options(
+                config=config.parse(settings, CAR),
+                config_name=CAR.name,
+                logs=[str(DRIVE / "drive.tlog"), str(DRIVE / "drive.candump.log")],
+                csv=track,
+                truth=DRIVE / "truth.csv",
+                window=SECONDS,
+            )
+        )
+        return summary, errors_of(track, summary.span.first_ns)
+
+
+def errors_of(track: Path, first_ns: int) -> Errors:
+    errors = Errors([], [], [])
+    with (DRIVE / "truth.csv").open() as reference, track.open() as file:
+        truth = Truth(parse_truth(reference, "truth.csv"))
+        for row in csv.DictReader(file):
+            t_ns = int(row["unix_us"]) * 1000
+            true, second = truth.at(t_ns), (t_ns - first_ns) / 1e9
+            if true is None or not row["lat_deg"] or not SECONDS.start_s <= second <= SECONDS.stop_s:
+                continue
+            origin = true.lat_deg, true.lon_deg
+            north, east = displacement(float(row["lat_deg"]), float(row["lon_deg"]), origin, true.height_m)
+            speed = math.hypot(true.vn_mps, true.ve_mps)
+            errors.second.append(second)
+            errors.along_m.append((north * true.vn_mps + east * true.ve_mps) / speed)
+            errors.across_m.append((east * true.vn_mps - north * true.ve_mps) / speed)
+    return errors
+
+
+# --- What a late fix does
+
+STEP_MS = 10  # between two inertial samples
+FIX_MS, ARRIVAL_MS, END_MS = 34, 112, 120
+SNAPSHOTS_MS = (0, 50, 100)
+
+
+def draw_rewind() -> None:
+    """A late fix: the events by their own time, before and after it has arrived."""
+    figure = figure_of(9, 3.6)
+    axes = figure.subplots(2, 1, sharex=True)
+    imu = np.arange(0, END_MS, STEP_MS)
+    for ax, title in zip(axes, ("1  a fix arrives at 112 ms: it tells of the instant 34 ms", "2  back to the snapshot"
+                         " at 0 ms, forward again, fix included, up to the newest IMU sample"), strict=True):  # fmt: skip
+        ax.set_title(title, loc="left", fontsize=10)
+        ax.plot(imu, np.zeros(len(imu)), "o", color=GREY, markersize=5)
+        ax.plot(np.arange(6, END_MS - STEP_MS, 12), np.full(9, 0.5), "s", color=GREEN, markersize=5)
+        for at in SNAPSHOTS_MS:
+            ax.axvline(at, color=BLUE, linewidth=5, alpha=0.25)
+        ax.set(ylim=(-0.6, 1.7), yticks=(0, 0.5, 1.1), yticklabels=("IMU", "wheels", "GNSS"))
+        ax.spines[["top", "right", "left"]].set_visible(False)
+        ax.tick_params(left=False)
+    arrow(axes[0], (ARRIVAL_MS, 1.1), (FIX_MS + 1.5, 1.1), VERMILION)
+    axes[0].plot(ARRIVAL_MS, 1.1, "D", color=VERMILION, fillstyle="none")
+    for ax in axes:
+        ax.plot(FIX_MS, 1.1, "D", color=VERMILION)
+    arrow(axes[1], (110, -0.38), (1, -0.38), BLUE, "--")
+    for begin, end in ((0, FIX_MS), (FIX_MS, 110)):
+        arrow(axes[1], (begin, 1.45), (end, 1.45), BLUE)
+    axes[1].annotate("the interval 30 to 40 ms is split at the fix", (FIX_MS, 1.1), (FIX_MS + 4, 1.0), fontsize=8)
+    axes[0].annotate("snapshot", (SNAPSHOTS_MS[1], 1.5), (SNAPSHOTS_MS[1] + 1.2, 1.4), fontsize=8, color=BLUE)
+    axes[1].set_xlabel("the instants that the events tell of [ms]")
+    path = IMAGES / "rewind.png"
+    figure.savefig(path)
+    shrink(path)
+
+
+def arrow(ax: Axes, tail: tuple[float, float], head: tuple[float, float], colour: str, style: str = "-") -> None:
+    look = {"arrowstyle": "->", "color": colour, "linestyle": style, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", head, tail, arrowprops=look)
+
+
+if __name__ == "__main__":
+    IMAGES.mkdir(exist_ok=True)
+    draw_rewind()
+    draw_demo()
+    draw_arrival()
