@@ -10,7 +10,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memmove, memset
 
 from fusiond import state as layout
-from fusiond import motion, observe, strapdown
+from fusiond import alignment, motion, observe, strapdown
 from fusiond.earth import GRAVITY_RATIO as _GRAVITY_RATIO
 from fusiond.kernel import Outcome
 from fusiond.observe import wheel_speed
@@ -66,6 +66,8 @@ cdef enum:
     SCATTER_FORCE = 18
     SCATTER_RATE = 19
     MEAN_WEIGHT = 20
+    REST_RATE_B = 21
+    FIRST_VELOCITY_N = 24
     CONSTRAINT_RATIO = 32
     AUXILIARY_SIZE = 35
     LAST_VALUE = 0
@@ -76,6 +78,8 @@ cdef enum:
     T_CONSTRAINT = 2
     T_STILL = 3
     T_POSITION = 4
+    T_FIRST_VELOCITY = 5
+    T_REST = 7
     PHASE = 9
     RESETS = 10
     CONSTRAINT_FUSED = 11
@@ -86,6 +90,7 @@ cdef enum:
     T_FUSED = 1
     T_REJECTED = 2
     SOURCE_STAMPS_SIZE = 3
+    ALIGNING = 1
     RUNNING = 2
     FUSED = 0
     REJECTED = 1
@@ -114,6 +119,7 @@ cdef double LONGEST_STEP = strapdown.LONGEST_STEP
 cdef double MEAN_TIME = motion.MEAN_TIME
 cdef double MEAN_FILLED = motion.MEAN_FILLED
 cdef int64_t WHEEL_FRESH_NS = motion.WHEEL_FRESH_NS
+cdef int64_t WINDOW_MOST_NS = alignment.WINDOW_MOST_NS
 cdef double LEAST_TRACK_SPEED = wheel_speed.LEAST_TRACK_SPEED
 cdef double SURE_SPEED = wheel_speed.SURE_SPEED
 cdef double DIRECTION_ALIKE = wheel_speed.DIRECTION_ALIKE
@@ -129,13 +135,15 @@ def check_layout():
         ("HELD_RATE_B", HELD_RATE_B), ("FORCE_B", FORCE_B), ("RATE_B", RATE_B), ("MEAN_FORCE_B", MEAN_FORCE_B),
         ("MEAN_RATE_B", MEAN_RATE_B), ("CONSTRAINT_RATIO", CONSTRAINT_RATIO), ("CONSTRAINT_FUSED", CONSTRAINT_FUSED),
         ("CONSTRAINT_REJECTED", CONSTRAINT_REJECTED),
+        ("REST_RATE_B", REST_RATE_B), ("FIRST_VELOCITY_N", FIRST_VELOCITY_N),
     ):
         assert getattr(layout, name).start == offset, name
     for name, number in (
         ("NOMINAL_SIZE", NOMINAL_SIZE), ("SCATTER_FORCE", SCATTER_FORCE), ("SCATTER_RATE", SCATTER_RATE),
         ("MEAN_WEIGHT", MEAN_WEIGHT), ("AUXILIARY_SIZE", AUXILIARY_SIZE), ("LAST_VALUE", LAST_VALUE),
         ("LAST_RATIO", LAST_RATIO), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
-        ("T_CONSTRAINT", T_CONSTRAINT), ("T_STILL", T_STILL), ("T_POSITION", T_POSITION), ("PHASE", PHASE),
+        ("T_CONSTRAINT", T_CONSTRAINT), ("T_STILL", T_STILL), ("T_POSITION", T_POSITION),
+        ("T_FIRST_VELOCITY", T_FIRST_VELOCITY), ("T_REST", T_REST), ("ALIGNING", ALIGNING), ("PHASE", PHASE),
         ("RESETS", RESETS), ("BLOWN", BLOWN), ("STAMPS_SIZE", STAMPS_SIZE), ("T_LAST", T_LAST), ("T_FUSED", T_FUSED),
         ("T_REJECTED", T_REJECTED), ("SOURCE_STAMPS_SIZE", SOURCE_STAMPS_SIZE), ("RUNNING", RUNNING), ("NEVER", NEVER),
     ):
@@ -794,7 +802,7 @@ cdef class Kernel:
     cdef Noise noise
     cdef int64_t imu_gap, restart_gap, gnss_reset, constraint_interval, still_after, snapshot_interval
     cdef bint standstill, non_holonomic
-    cdef double still_wheel, still_gyro2, still_accel2, zero_velocity_factor
+    cdef double course_speed, still_wheel, still_gyro2, still_accel2, zero_velocity_factor
     cdef double[::1] head_numbers
     cdef int64_t[::1] head_whole
     cdef Row[::1] table
@@ -831,6 +839,7 @@ cdef class Kernel:
         self.snapshot_interval = plan.snapshot_interval_ns
         self.standstill = plan.motion.standstill
         self.non_holonomic = plan.motion.non_holonomic
+        self.course_speed = plan.filter.course_speed_mps
         self.still_wheel = plan.motion.still_wheel_mps
         self.still_gyro2 = plan.still_gyro * plan.still_gyro
         self.still_accel2 = plan.motion.still_accel_mps2 * plan.motion.still_accel_mps2
@@ -926,6 +935,8 @@ cdef class Kernel:
             return place
         while i > begin and self.models[self.table[i - 1].source] != IMU:
             i -= 1
+        while begin < i < begin + place and self.table[i].t_ns == self.table[i - 1].t_ns:
+            i += 1
         return i - begin
 
     def outcome(self, Py_ssize_t at):
@@ -956,7 +967,7 @@ cdef class Kernel:
                     done = True
                     break
                 row = rows + applied
-                if kept == room or self.stamps[PHASE] != RUNNING or self.models[row.source] >= COMPILED:
+                if kept == room or not self.knows(self.models[row.source]):
                     break
                 if row.t_ns - self.stamps[T] > self.restart_gap:
                     break
@@ -990,6 +1001,10 @@ cdef class Kernel:
             row.outcome = DUPLICATE
             return
         row.outcome = FUSED
+        if self.stamps[PHASE] == ALIGNING:
+            self.gather(row)
+            self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] = row.t_ns
+            return
         self.advance(row.t_ns, imu)
         if self.models[row.source] == IMU:
             self.hold(row)
@@ -997,6 +1012,46 @@ cdef class Kernel:
             self.measure(row)
         self.guard(whole_size)
         self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] = row.t_ns
+
+    cdef bint knows(self, int32_t model) noexcept nogil:
+        """Whether this kernel can take an event of a model now; a start is left to the twin, and with it GNSS until then."""
+        if self.stamps[PHASE] == RUNNING:
+            return model < COMPILED
+        return self.stamps[PHASE] == ALIGNING and (model == IMU or model == WHEEL_SPEED)
+
+    cdef void gather(self, Row* row) noexcept nogil:
+        """fusiond.alignment.gather, for inertial samples and wheels."""
+        cdef double* a = self.auxiliary
+        cdef double north, east
+        cdef bint still, driving
+        cdef int i
+        self.stamps[T] = row.t_ns
+        if self.models[row.source] == WHEEL_SPEED:
+            self.memory[row.source * MEMORY_SIZE + LAST_VALUE] = row.values[0]
+            return
+        if self.stamps[T_IMU] != NEVER:
+            self.watch(row, (row.t_ns - self.stamps[T_IMU]) * 1e-9)
+        self.keep_sample(row)
+        still = self.stamps[T_STILL] != NEVER and row.t_ns - self.stamps[T_STILL] >= self.still_after
+        driving = False
+        if self.stamps[T_FIRST_VELOCITY] != NEVER and row.t_ns - self.stamps[T_FIRST_VELOCITY] <= WINDOW_MOST_NS:
+            north = a[FIRST_VELOCITY_N]
+            east = a[FIRST_VELOCITY_N + 1]
+            driving = sqrt(north * north + east * east) >= self.course_speed
+        if still and not driving:
+            for i in range(3):
+                a[REST_RATE_B + i] = a[MEAN_RATE_B + i]
+            self.stamps[T_REST] = row.t_ns
+
+    cdef void keep_sample(self, Row* row) noexcept nogil:
+        cdef double* a = self.auxiliary
+        cdef int i
+        self.stamps[T_IMU] = row.t_ns
+        for i in range(3):
+            a[HELD_FORCE_B + i] = row.values[i]
+            a[FORCE_B + i] = row.values[i]
+            a[HELD_RATE_B + i] = row.values[3 + i]
+            a[RATE_B + i] = row.values[3 + i]
 
     cdef void guard(self, Py_ssize_t whole_size) noexcept nogil:
         """fusiond.kernel.guard: a state that is no longer finite is emptied, and aligns anew."""
@@ -1047,17 +1102,10 @@ cdef class Kernel:
         propagate(self.x, self.p, dt, force, rate, &self.noise)
 
     cdef void hold(self, Row* row) noexcept nogil:
-        cdef double* a = self.auxiliary
         cdef double dt = 0.0
-        cdef int i
         if self.stamps[T_IMU] != NEVER:
             dt = (row.t_ns - self.stamps[T_IMU]) * 1e-9
-        self.stamps[T_IMU] = row.t_ns
-        for i in range(3):
-            a[HELD_FORCE_B + i] = row.values[i]
-            a[FORCE_B + i] = row.values[i]
-            a[HELD_RATE_B + i] = row.values[3 + i]
-            a[RATE_B + i] = row.values[3 + i]
+        self.keep_sample(row)
         self.watch(row, dt)
         self.constrain()
 

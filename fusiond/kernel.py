@@ -149,13 +149,15 @@ class Kernel:
 
     def first_changed(self, begin: int, place: int) -> int:
         """The first row whose result a new event at row `place` changes: itself, but for an IMU sample all that
-        interpolate between it and the sample before it."""
+        interpolate between it and the sample before it, so not those at that sample's own instant."""
         models, table = self.plan.models, self.table
         i = begin + place
         if models[table[i]["source"]] != IMU:
             return place
         while i > begin and models[table[i - 1]["source"]] != IMU:
             i -= 1
+        while begin < i < begin + place and table[i]["t_ns"] == table[i - 1]["t_ns"]:
+            i += 1
         return i - begin
 
     def outcome(self, at: int) -> int:

@@ -113,7 +113,8 @@ def measurements(
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0),
     accel_bias: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> list[Measurement]:
-    """What the sensors of `config` say of a drive, in the order of their stamps; without noise where seed is None."""
+    """What the sensors of `config` say of a drive, in the order of their stamps; without noise where seed is None. An IMU
+    at rest is ten times as quiet as one on the road."""
     rng = np.random.default_rng(seed or 0)
     strength = 0.0 if seed is None else 1.0
     step = truth.seconds[1] - truth.seconds[0]
@@ -127,8 +128,9 @@ def measurements(
         return strength * sigma * rng.standard_normal(size)
 
     for k in range(len(truth.seconds)):
-        force = truth.force_b[k] + noise(0.05 / math.sqrt(step)) + accel_bias
-        rate = truth.rate_b[k] + noise(0.002 / math.sqrt(step)) + gyro_bias
+        shaken = 1.0 if truth.speed[k] > 0.1 else 0.1
+        force = truth.force_b[k] + shaken * noise(0.05 / math.sqrt(step)) + accel_bias
+        rate = truth.rate_b[k] + shaken * noise(0.002 / math.sqrt(step)) + gyro_bias
         add("imu0", k, k, ImuSample(triple(force), triple(rate)))
     for i, k in enumerate(range(3, len(truth.seconds), round(1 / gnss_hz / step))):
         off = noise(1.0)
