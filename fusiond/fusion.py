@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fusiond.clock import Clock
-from fusiond.config import Config
+from fusiond.config import Config, Imu
 from fusiond.earth import Array, geodetic, mat_ne
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.history import History
 from fusiond.kernel import Outcome
-from fusiond.measurements import GnssPosition, ImuSample, Invalid, Measurement, Received, WheelSpeed
-from fusiond.observe import gnss_position, gnss_velocity, wheel_speed
-from fusiond.plan import SECOND, nanoseconds, plan
+from fusiond.measurements import ImuSample, Invalid, Measurement, Received
+from fusiond.observe import MODELS
+from fusiond.observe.model import Unusable, within
+from fusiond.plan import IMU, SECOND, nanoseconds, plan, section_of
 from fusiond.rotation import matrix, product, quaternion
 from fusiond.state import (
     ACCEL_BIAS,
@@ -46,8 +48,6 @@ from fusiond.state import (
 )
 
 LOST_IMU_NS = 5 * SECOND  # without an inertial sample for so long the state is called lost
-HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
-SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
 
 
 class Receipt(NamedTuple):
@@ -67,6 +67,10 @@ class Fusion:
         self.plan = plan(config)
         self.clock = Clock(config)
         self.history = History(self.plan, compiled)
+        self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
+            source: (imu_values if model == IMU else MODELS[model].values, section_of(source, model, config))
+            for source, model in zip(self.plan.sources, self.plan.models, strict=True)
+        }
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 
     def receive(self, received: Received) -> Receipt | None:
@@ -83,7 +87,7 @@ class Fusion:
             raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.plan.sources)}")
         try:
             values = self._values(measurement)
-        except _Unusable as unusable:
+        except Unusable as unusable:
             reason = str(unusable)
             self.invalid[measurement.source][reason] += 1
             outcome = self.history.count(self.history.index[measurement.source], Outcome.INVALID)
@@ -114,27 +118,14 @@ class Fusion:
         return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
 
     def _values(self, measurement: Measurement) -> tuple[float, ...]:
-        """A payload as a row of numbers. Raises _Unusable."""
+        """A payload as a row of numbers. Raises Unusable."""
         payload = measurement.payload
         if isinstance(payload, Invalid):
-            raise _Unusable(payload.reason)
-        values: tuple[float, ...]
-        if isinstance(payload, WheelSpeed):
-            values = wheel_speed.values(payload, self.config.wheel[measurement.source])
-            _within(values[:1], SPEED_LIMIT, "impossible speed")
-        elif isinstance(payload, ImuSample):
-            imu = self.config.imu[measurement.source]
-            _within(payload.specific_force_b, imu.accel_limit, "beyond the accelerometer's range")
-            _within(payload.angular_rate_b, imu.gyro_limit, "beyond the gyro's range")
-            values = payload.specific_force_b + payload.angular_rate_b
-        elif isinstance(payload, GnssPosition):
-            _on_earth(payload)
-            values = gnss_position.values(payload, self.config.gnss[measurement.source.partition(".")[0]])
-        else:
-            values = gnss_velocity.values(payload, self.config.gnss[measurement.source.partition(".")[0]])
-            _within(values[:3], SPEED_LIMIT, "impossible speed")
+            raise Unusable(payload.reason)
+        to_values, section = self._rows[measurement.source]
+        values = to_values(payload, section)
         if not math.isfinite(sum(values)):
-            raise _Unusable("not finite")
+            raise Unusable("not finite")
         return values
 
     def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
@@ -152,23 +143,11 @@ class Fusion:
         return Estimate(t_ns, mode, age, int(stamps[RESETS]), answer)
 
 
-class _Unusable(Exception):
-    """A payload that must not reach the filter; the message is the reason."""
-
-
-def _within(values: tuple[float, ...], limit: float, complaint: str) -> None:
-    """Every value finite and at most `limit` in size."""
-    for value in values:
-        if not -limit <= value <= limit:
-            raise _Unusable(complaint if math.isfinite(value) else "not finite")
-
-
-def _on_earth(fix: GnssPosition) -> None:
-    low, high = HEIGHT_LIMITS
-    _within((fix.latitude,), math.pi / 2, "impossible position")
-    _within((fix.longitude,), 2 * math.pi, "impossible position")
-    if not low <= fix.height <= high:
-        raise _Unusable("impossible position" if math.isfinite(fix.height) else "not finite")
+def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
+    """Specific force (3,) [m/s^2] and angular rate (3,) [rad/s]. Raises Unusable."""
+    within(sample.specific_force_b, imu.accel_limit, "beyond the accelerometer's range")
+    within(sample.angular_rate_b, imu.gyro_limit, "beyond the gyro's range")
+    return sample.specific_force_b + sample.angular_rate_b
 
 
 def state_estimate(state: FilterState) -> StateEstimate:

@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fusiond.config import Config, Filter, Imu, Motion
 from fusiond.earth import Array
 from fusiond.elementary import square
-from fusiond.observe import (
-    MODELS,
-    gnss_position,
-    gnss_velocity,
-    non_holonomic,
-    wheel_speed,
-    zero_rotation,
-    zero_velocity,
-)
+from fusiond.observe import CONSTRAINTS, MODELS
 from fusiond.observe.model import PARAMETERS
 from fusiond.strapdown import ProcessNoise
 from fusiond.update import chi_square, correlation_factor
@@ -56,33 +49,33 @@ class Plan:
     imu: Imu
 
 
+def section_of(source: str, model: int, config: Config) -> Any:
+    """The table of the configuration that a source stands in."""
+    if model == IMU:
+        return config.imu[source]
+    table: dict[str, Any] = getattr(config, MODELS[model].table or "")
+    return table[source.removesuffix(MODELS[model].suffix)]
+
+
 def plan(config: Config) -> Plan:
     """Lay a configuration out for the kernel."""
-    sources = config.sources()
-    models, rows = [], []
-    for source in sources:
-        name, _, kind = source.partition(".")
-        if name in config.imu:
-            models.append(IMU)
-            rows.append(np.zeros(PARAMETERS))
-        elif kind == "position":
-            models.append(MODEL["gnss_position"])
-            rows.append(gnss_position.parameters(config.gnss[name]))
-        elif kind == "velocity":
-            models.append(MODEL["gnss_velocity"])
-            rows.append(gnss_velocity.parameters(config.gnss[name]))
-        else:
-            models.append(MODEL["wheel_speed"])
-            rows.append(wheel_speed.parameters(config.wheel[name]))
+    found = dict.fromkeys(config.imu, IMU)
+    for number, model in enumerate(MODELS):
+        if model.table is not None:
+            found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
+    sources = tuple(sorted(found))
+    models = tuple(found[source] for source in sources)
+    rows = [
+        np.zeros(PARAMETERS) if model == IMU else MODELS[model].parameters(section_of(source, model, config))
+        for source, model in zip(sources, models, strict=True)
+    ]
     (imu,) = config.imu.values()
     motion, settings = config.motion, config.filter
     return Plan(
         sources=sources,
-        models=tuple(models),
+        models=models,
         parameters=np.array(rows),
-        constraints=np.array(
-            [non_holonomic.parameters(motion), zero_velocity.parameters(motion), zero_rotation.parameters(motion)]
-        ),
+        constraints=np.array([constraint.parameters(motion) for constraint in CONSTRAINTS]),
         gates=(math.inf, *(chi_square(settings.gate_probability, freedom) for freedom in (1, 2, 3))),
         noise=ProcessNoise(
             accel=square(imu.accel_noise),

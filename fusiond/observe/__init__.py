@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fusiond.earth import Array
-from fusiond.measurements import GnssPosition, GnssVelocity, WheelSpeed
 from fusiond.observe import gnss_position, gnss_velocity, non_holonomic, wheel_speed, zero_rotation, zero_velocity
 from fusiond.observe.model import Observation
 from fusiond.state import FilterState
 
 
 class Model(NamedTuple):
-    """`payload` is what a source of this model sends; None marks a constraint that the filter applies by itself."""
+    """One kind of measurement. A source of it is called by the name of its table in the configuration, [table.NAME], with
+    the suffix. `values` makes a row of numbers of a payload and that table, `parameters` another of the table alone, and
+    `observe` takes both. Without a table it is a constraint, which the filter applies by itself."""
 
     name: str
-    payload: type | None
+    table: str | None
+    suffix: str
+    parameters: Callable[[Any], Array]
+    values: Callable[[Any, Any], tuple[float, ...]]
     observe: Callable[[FilterState, Array, Array], Observation | None]
 
 
+def no_values(payload: Any, section: Any) -> tuple[float, ...]:
+    """Of a constraint, which has no payload."""
+    return ()
+
+
 MODELS = (
-    Model("gnss_position", GnssPosition, gnss_position.observe),
-    Model("gnss_velocity", GnssVelocity, gnss_velocity.observe),
-    Model("wheel_speed", WheelSpeed, wheel_speed.observe),
-    Model("non_holonomic", None, non_holonomic.observe),
-    Model("zero_velocity", None, zero_velocity.observe),
-    Model("zero_rotation", None, zero_rotation.observe),
+    Model("gnss_position", "gnss", ".position", gnss_position.parameters, gnss_position.values, gnss_position.observe),
+    Model("gnss_velocity", "gnss", ".velocity", gnss_velocity.parameters, gnss_velocity.values, gnss_velocity.observe),
+    Model("wheel_speed", "wheel", "", wheel_speed.parameters, wheel_speed.values, wheel_speed.observe),
+    Model("non_holonomic", None, "", non_holonomic.parameters, no_values, non_holonomic.observe),
+    Model("zero_velocity", None, "", zero_velocity.parameters, no_values, zero_velocity.observe),
+    Model("zero_rotation", None, "", zero_rotation.parameters, no_values, zero_rotation.observe),
 )
-CONSTRAINTS = MODELS[3:]
+CONSTRAINTS = tuple(model for model in MODELS if model.table is None)

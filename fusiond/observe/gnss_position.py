@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusiond.config import Gnss
 from fusiond.earth import Array, ecef, mat_ne
 from fusiond.elementary import square
 from fusiond.measurements import GnssPosition
-from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, mat_eb
+from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, Unusable, mat_eb, within
 from fusiond.rotation import skew
 from fusiond.state import ATTITUDE, POSITION, POSITION_E, FilterState
 
 PLACE_E = slice(0, 3)  # m, values
 VARIANCE_HORIZONTAL, VARIANCE_VERTICAL = 3, 4  # m^2, values
+
+HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
 
 
 def parameters(gnss: Gnss) -> Array:
@@ -25,7 +29,11 @@ def parameters(gnss: Gnss) -> Array:
 
 def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
     """Place (3,) earth-fixed [m], variances horizontal and vertical [m^2]: the receiver's own sigma, where it gives one,
-    but never below the configured one."""
+    but never below the configured one. Raises Unusable."""
+    within((fix.latitude,), math.pi / 2, "impossible position")
+    within((fix.longitude,), 2 * math.pi, "impossible position")
+    if not HEIGHT_LIMITS[0] <= fix.height <= HEIGHT_LIMITS[1]:
+        raise Unusable("impossible position" if math.isfinite(fix.height) else "not finite")
     horizontal = max(fix.sigma_horizontal or 0.0, gnss.position_sigma_m)
     vertical = max(fix.sigma_vertical or 0.0, gnss.height_sigma_m)
     return (*(float(c) for c in ecef(fix.latitude, fix.longitude, fix.height)), square(horizontal), square(vertical))

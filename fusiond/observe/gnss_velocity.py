@@ -8,7 +8,7 @@ from fusiond.config import Gnss
 from fusiond.earth import Array, mat_ne
 from fusiond.elementary import square
 from fusiond.measurements import GnssVelocity
-from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, mat_eb, rate_b
+from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, SPEED_LIMIT, Observation, mat_eb, rate_b, within
 from fusiond.rotation import skew
 from fusiond.state import ATTITUDE, GYRO_BIAS, POSITION_E, VELOCITY, VELOCITY_E, FilterState
 
@@ -25,7 +25,8 @@ def parameters(gnss: Gnss) -> Array:
 
 
 def values(velocity: GnssVelocity, gnss: Gnss) -> tuple[float, ...]:
-    """Velocity (3,) north-east-down [m/s], variance per axis, number of axes given."""
+    """Velocity (3,) north-east-down [m/s], variance per axis, number of axes given. Raises Unusable."""
+    within((velocity.north, velocity.east, velocity.down or 0.0), SPEED_LIMIT, "impossible speed")
     variance = square(max(velocity.sigma or 0.0, gnss.velocity_sigma_mps))
     if velocity.down is None:
         return velocity.north, velocity.east, 0.0, variance, 2.0

@@ -6,6 +6,7 @@ configuration). It returns an `Observation`, or a reason why there is none.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +29,21 @@ from fusiond.state import (
 
 VALUES = 8  # width of a measurement's row
 PARAMETERS = 12  # width of a source's row
+SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
 LEVER_ARM_B = slice(0, 3)  # parameters that models share: m, the sensor from the IMU
 CORRELATION = 3  # s, over which the sensor's errors stay alike
 
+
+
+class Unusable(Exception):
+    """A payload that must not reach the filter; the message is the reason."""
+
+
+def within(values: tuple[float, ...], limit: float, complaint: str) -> None:
+    """Every value finite and at most `limit` in size, or Unusable."""
+    for value in values:
+        if not -limit <= value <= limit:
+            raise Unusable(complaint if math.isfinite(value) else "not finite")
 
 
 class Observation(NamedTuple):

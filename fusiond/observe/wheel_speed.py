@@ -14,7 +14,7 @@ from fusiond.config import Wheel
 from fusiond.earth import Array
 from fusiond.elementary import exp, square
 from fusiond.measurements import WheelSpeed
-from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
+from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, SPEED_LIMIT, Observation, point_velocity_v, within
 from fusiond.state import SCALE, WHEEL_SCALE, FilterState
 
 SPEED, VARIANCE, ALIKE = 0, 1, 2  # m/s, (m/s)^2, s over which errors stay alike: values
@@ -28,14 +28,16 @@ LEAST_TRACK_SPEED = 0.5  # m/s: below this the direction of a steered wheel's tr
 def parameters(wheel: Wheel) -> Array:
     row = np.zeros(PARAMETERS)
     row[LEVER_ARM_B] = wheel.position_m
-    row[STEERED], row[UNSIGNED] = float(wheel.steered), float(wheel.unsigned)
+    row[STEERED] = float(wheel.steered)
+    row[UNSIGNED] = float(wheel.unsigned and wheel.direction_signal is None)
     return row
 
 
 def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     """Speed [m/s], its variance (the white noise and that of rounding to a quantum, quantum^2/12), and the time over which
     its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the same
-    from reading to reading."""
+    from reading to reading. Raises Unusable."""
+    within((reading.speed,), SPEED_LIMIT, "impossible speed")
     variance, alike = square(wheel.sigma_mps) + square(wheel.quantum_mps) / 12, wheel.correlation_s
     if abs(reading.speed) < wheel.least_mps:
         return reading.speed, variance + square(wheel.least_mps) / 3, max(alike, SLOW_ALIKE)

@@ -61,8 +61,9 @@ def tilted(events: list[Measurement], roll: float, pitch: float) -> list[Measure
     for event in events:
         if isinstance(event.payload, ImuSample):
             force, rate = (tuple((turn @ part).tolist()) for part in msgspec.structs.astuple(event.payload))
-            event = msgspec.structs.replace(event, payload=ImuSample(force, rate))
-        held.append(event)
+            held.append(msgspec.structs.replace(event, payload=ImuSample(force, rate)))
+        else:
+            held.append(event)
     return held
 
 
@@ -170,8 +171,7 @@ def test_waits_for_the_imu(compiled: bool) -> None:
 
 def later(events: list[Measurement], shift_ns: int) -> list[Measurement]:
     return [
-        Measurement(e.t_ns + shift_ns, e.source, e.sequence + 10**6, e.t_receive_ns + shift_ns, e.payload)
-        for e in events
+        Measurement(e.t_ns + shift_ns, e.source, e.sequence + 10**6, e.t_receive_ns + shift_ns, e.payload) for e in events
     ]
 
 

@@ -86,14 +86,14 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     """A state that moves forward along its own axis, with a little of everything else."""
     state = running_state(rng)
     slip = 0.1 if abs(speed) > 1 else 0.01
-    state.nominal[VELOCITY_E] = mat_eb(state) @ (rng.normal(0.0, slip, 3) + (speed, 0.0, 0.0))
+    state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
     state.auxiliary[RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
     return state
 
 
 def test_every_model_has_a_case() -> None:
     assert {case.model for case in CASES.values()} == {model.name for model in MODELS}
-    assert all(model.payload is None for model in CONSTRAINTS)
+    assert all(model.table is None for model in CONSTRAINTS)
 
 
 def predicted(observe: Callable[..., object], state: FilterState, row: Array, parameters: Array) -> Array:
