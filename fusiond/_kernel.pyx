@@ -893,7 +893,7 @@ cdef class Kernel:
         self.kept_whole = kept_whole
         self.kept_applied = kept_applied
 
-    def place(self, Py_ssize_t begin, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence):
+    cpdef Py_ssize_t place(self, Py_ssize_t begin, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence):
         """fusiond.kernel.Kernel.place"""
         cdef Py_ssize_t i = end
         cdef const Row* row
@@ -912,7 +912,7 @@ cdef class Kernel:
             i -= 1
         return i - begin
 
-    def insert(self, Py_ssize_t at, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence,
+    cpdef insert(self, Py_ssize_t at, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence,
                int64_t t_receive_ns, int32_t outcome, tuple values):
         """fusiond.kernel.Kernel.insert"""
         cdef Row* row = &self.table[at]
@@ -928,7 +928,7 @@ cdef class Kernel:
             row.values[i] = values[i]
         self.counts[source, outcome] += 1
 
-    def first_changed(self, Py_ssize_t begin, Py_ssize_t place):
+    cpdef Py_ssize_t first_changed(self, Py_ssize_t begin, Py_ssize_t place):
         """fusiond.kernel.Kernel.first_changed"""
         cdef Py_ssize_t i = begin + place
         if self.models[self.table[i].source] != IMU:
@@ -939,11 +939,29 @@ cdef class Kernel:
             i += 1
         return i - begin
 
+    def offer(self, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, Py_ssize_t kept, int64_t limit_ns, int64_t t_ns,
+              int32_t source, int64_t sequence, int64_t t_receive_ns, int32_t waiting, tuple values):
+        """fusiond.kernel.Kernel.offer"""
+        cdef Py_ssize_t place = self.place(begin, end, t_ns, source, sequence), first_changed, rerun = 0
+        cdef bint done
+        if place < 0:
+            return place, applied, kept, 0, True
+        self.insert(begin + place, end, t_ns, source, sequence, t_receive_ns, waiting, values)
+        first_changed = self.first_changed(begin, place)
+        if place < applied:
+            applied += 1
+        if first_changed < applied:
+            kept = self.restore(kept, first_changed)
+            rerun = applied - self.kept_applied[kept - 1]
+            applied -= rerun
+        done = self.go(begin, end + 1, &applied, limit_ns, &kept)
+        return place, applied, kept, rerun, done
+
     def outcome(self, Py_ssize_t at):
         """fusiond.kernel.Kernel.outcome"""
         return self.table[at].outcome
 
-    def restore(self, Py_ssize_t kept, Py_ssize_t first_changed):
+    cpdef Py_ssize_t restore(self, Py_ssize_t kept, Py_ssize_t first_changed):
         """fusiond.kernel.Kernel.restore"""
         while self.kept_applied[kept - 1] > first_changed:
             kept -= 1
@@ -953,6 +971,12 @@ cdef class Kernel:
 
     def run(self, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, int64_t limit_ns, Py_ssize_t kept):
         """fusiond.kernel.Kernel.run"""
+        cdef bint done = self.go(begin, end, &applied, limit_ns, &kept)
+        return applied, kept, done
+
+    cdef bint go(self, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t* applied_io, int64_t limit_ns,
+                 Py_ssize_t* kept_io) except -1:
+        cdef Py_ssize_t applied = applied_io[0], kept = kept_io[0]
         cdef Row* rows = &self.table[0] + begin
         cdef Py_ssize_t count = end - begin, following = applied, room = self.kept_applied.shape[0]
         cdef Py_ssize_t whole_size = self.head_whole.shape[0]
@@ -988,7 +1012,9 @@ cdef class Kernel:
                     memcpy(&self.kept_whole[kept, 0], self.stamps, whole_size * sizeof(int64_t))
                     self.kept_applied[kept] = applied
                     kept += 1
-        return applied, kept, done
+        applied_io[0] = applied
+        kept_io[0] = kept
+        return done
 
     cdef void step(self, Row* rows, Py_ssize_t index, Row* imu, Py_ssize_t whole_size) noexcept nogil:
         cdef Row* row = rows + index

@@ -69,28 +69,36 @@ class History:
 
     def offer(self, measurement: Measurement, values: tuple[float, ...]) -> Outcome:
         """Put one event where it belongs in time and bring the head up to date. Returns its outcome, for now."""
-        kernel, t_ns, sequence = self.kernel, measurement.t_ns, measurement.sequence
-        source = self.index[measurement.source]
+        t_ns, source = measurement.t_ns, self.index[measurement.source]
         if t_ns < self.settled_ns:
             return self.count(source, Outcome.TOO_OLD)
         if self._end == len(self._table):
             self._make_room()
-        place = kernel.place(self._begin, self._end, t_ns, source, sequence)
-        if place < 0:
-            return self.count(source, Outcome.DUPLICATE)
-        at = self._begin + place
-        kernel.insert(at, self._end, t_ns, source, sequence, measurement.t_receive_ns, WAITING, values)
-        self._end += 1
-        self._newest_ns = max(self._newest_ns, t_ns)
+        if t_ns > self._newest_ns:
+            self._newest_ns = t_ns
         if self.plan.models[source] == IMU and t_ns > self._newest_imu_ns:
             self._newest_imu_ns = t_ns
-        first_changed = kernel.first_changed(self._begin, place)
-        if place < self._applied:  # for the moment it counts among the applied: the rewind takes it out
-            self._applied += 1
-        if first_changed < self._applied:
-            self._rewind(first_changed)
-        self._run()
-        outcome: Outcome = OUTCOMES[kernel.outcome(at)]
+        kept, limit = self._snapshots, self.applied_ns
+        place, self._applied, kept.end, rerun, done = self.kernel.offer(
+            self._begin,
+            self._end,
+            self._applied,
+            kept.end,
+            limit,
+            t_ns,
+            source,
+            measurement.sequence,
+            measurement.t_receive_ns,
+            WAITING,
+            values,
+        )
+        if place < 0:
+            return self.count(source, Outcome.DUPLICATE)
+        self._end += 1
+        self.rerun += rerun
+        if not done:
+            self._run(limit)
+        outcome: Outcome = OUTCOMES[self.kernel.outcome(self._begin + place)]
         self._until_forgetting -= 1
         if not self._until_forgetting:
             self._forget()
@@ -107,20 +115,12 @@ class History:
         self._forget()
         return self._snapshots.first()
 
-    def _rewind(self, first_changed: int) -> None:
-        """Restore the head from the newest snapshot that holds no changed row."""
-        kept = self._snapshots
-        kept.end = self.kernel.restore(kept.end, first_changed)
-        applied = int(kept.applied[kept.end - 1])
-        self.rerun += self._applied - applied
-        self._applied = applied
-
-    def _run(self) -> None:
-        """Apply the rows up to `applied_ns`."""
-        limit, kept, done = self.applied_ns, self._snapshots, False
+    def _run(self, limit_ns: int) -> None:
+        """Apply the rows up to `limit_ns`: what the kernel's loop left, for want of memory or as not its own."""
+        kept, done = self._snapshots, False
         while not done:
             before = self._applied
-            self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, limit, kept.end)
+            self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, limit_ns, kept.end)
             if done:
                 return
             if kept.end == len(kept.applied):

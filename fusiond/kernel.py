@@ -160,6 +160,38 @@ class Kernel:
             i += 1
         return i - begin
 
+    def offer(
+        self,
+        begin: int,
+        end: int,
+        applied: int,
+        kept: int,
+        limit_ns: int,
+        t_ns: int,
+        source: int,
+        sequence: int,
+        t_receive_ns: int,
+        waiting: int,
+        values: tuple[float, ...],
+    ) -> tuple[int, int, int, int, bool]:
+        """Place an event, insert it with the outcome `waiting`, rewind to before the first row that it changes, and run up
+        to `limit_ns`. Returns its place (-1: its very key is there already), the rows applied, the snapshots kept, the
+        rows that were un-applied for it, and whether it is done (see `run`)."""
+        place = self.place(begin, end, t_ns, source, sequence)
+        if place < 0:
+            return place, applied, kept, 0, True
+        self.insert(begin + place, end, t_ns, source, sequence, t_receive_ns, waiting, values)
+        first_changed = self.first_changed(begin, place)
+        if place < applied:  # for the moment it counts among the applied: the rewind takes it out
+            applied += 1
+        rerun = 0
+        if first_changed < applied:
+            kept = self.restore(kept, first_changed)
+            rerun = applied - int(self.kept_applied[kept - 1])
+            applied -= rerun
+        applied, kept, done = self.run(begin, end + 1, applied, limit_ns, kept)
+        return place, applied, kept, rerun, done
+
     def outcome(self, at: int) -> int:
         return int(self.table[at]["outcome"])
 
