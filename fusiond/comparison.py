@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
@@ -188,14 +188,20 @@ class Histogram:
 
     def __init__(self, step: float, limit: float) -> None:
         self._step, self._last = step, round(limit / step)
-        self._bins: Counter[int] = Counter()
+        self._bins: defaultdict[int, int] = defaultdict(int)
         self.count = 0
         self.least, self.greatest = math.inf, -math.inf
 
     def add(self, value: float) -> None:
-        self._bins[max(-self._last, min(self._last, math.floor(value / self._step)))] += 1
+        place = math.floor(value / self._step)
+        if not -self._last <= place <= self._last:
+            place = self._last if place > 0 else -self._last
+        self._bins[place] += 1
         self.count += 1
-        self.least, self.greatest = min(self.least, value), max(self.greatest, value)
+        if value < self.least:
+            self.least = value
+        if value > self.greatest:
+            self.greatest = value
 
     def quantile(self, share: float) -> float:
         """The least value that at least this share of all does not exceed."""

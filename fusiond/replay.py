@@ -111,11 +111,10 @@ class Replay:
         self.events += 1
         if isinstance(event.payload, ClockPair):
             self.clock_pairs += 1
-        if any(
-            event.source in held.sources and held.start_ns <= self.elapsed_ns < held.stop_ns for held in self._wants.withheld
-        ):
-            self._withheld[event.source] += 1
-            return
+        for held in self._wants.withheld:
+            if event.source in held.sources and held.start_ns <= self.elapsed_ns < held.stop_ns:
+                self._withheld[event.source] += 1
+                return
         receipt = self.engine.take(event)
         if receipt is None:
             return
