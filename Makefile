@@ -27,7 +27,7 @@ study: $(READY)
 	$(BIN)/python -m pytest -m slow
 
 bench: $(READY)
-	set -e; for file in benchmarks/*.py; do $(BIN)/python $$file; done
+	$(BIN)/python -m benchmarks.run
 
 # The bundled drive: the simulator's, packed so that the same scenario gives the same bytes.
 demo-data: $(READY)

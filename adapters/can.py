@@ -10,7 +10,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cantools
 from cantools.database.can import Database, Message
@@ -20,6 +20,7 @@ from fusiond.measurements import AnyPayload, Invalid, Received, WheelSpeed
 
 Item = TypeVar("Item")
 
+NUMBER = (int, float)
 EXTENDED = 1 << 31  # set in the keys of 29-bit ids, as in a DBC file and in Linux
 
 METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
@@ -99,25 +100,22 @@ class _WheelReader:
         self._needed = [wheel.signal, *(guard for guard in guards if guard is not None)]
         self._counter: float | None = None  # last value of counter_signal
 
-    def read(self, signals: Mapping[str, object], short: bool) -> WheelSpeed | Invalid | None:
+    def read(self, signals: Mapping[str, Any], short: bool) -> WheelSpeed | Invalid | None:
         """None where the frame, multiplexed, carries other signals this time."""
-        values: dict[str, float] = {}
         for name in self._needed:
-            value = signals.get(name)
-            if not isinstance(value, int | float):
+            if not isinstance(signals.get(name), NUMBER):
                 return Invalid("short frame") if short else None
-            values[name] = value
         wheel = self._wheel
         if wheel.counter_signal is not None:
-            last, self._counter = self._counter, values[wheel.counter_signal]
+            last, self._counter = self._counter, signals[wheel.counter_signal]
             if self._counter == last:
                 return Invalid("stale counter")
-        if wheel.valid_signal is not None and values[wheel.valid_signal] != wheel.valid_value:
+        if wheel.valid_signal is not None and signals[wheel.valid_signal] != wheel.valid_value:
             return Invalid("valid_signal")
-        speed = values[wheel.signal] * self._factor
+        speed: float = signals[wheel.signal] * self._factor
         if not math.isfinite(speed):
             return Invalid("not finite")
-        if wheel.direction_signal is not None and values[wheel.direction_signal] == wheel.reverse_value:
+        if wheel.direction_signal is not None and signals[wheel.direction_signal] == wheel.reverse_value:
             speed = -speed
         return WheelSpeed(speed)
 

@@ -18,10 +18,11 @@ import pkgutil
 import re
 from collections.abc import Callable
 from operator import itemgetter
-from types import ModuleType
+from struct import Struct
 from typing import Any
 
 import pymavlink.dialects.v20 as dialects
+from fastcrc.crc16 import mcrf4xx
 
 from fusiond.config import Config, ConfigError, Gnss, Imu
 from fusiond.measurements import (
@@ -41,6 +42,8 @@ MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 MAGIC = re.compile(b"[\xfd\xfe]")
 SIGNED = 0x01  # the one incompatibility flag that is defined
 HEADER_1, HEADER_2, CHECKSUM, SIGNATURE = 6, 10, 2, 13  # bytes
+SENDER_1 = Struct("<BBBB")  # at 2: counter, system, component, message id
+SENDER_2 = Struct("<BBBHB")  # at 4: the same, the id in two parts
 LENGTH_KNOWN = 3  # bytes of a frame that tell its length
 LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 
@@ -80,6 +83,16 @@ def message_id(frame: Bytes) -> int:
     return frame[5]
 
 
+def is_sound(frame: bytes, seed: bytes) -> bool:
+    """Is a frame's checksum right? `seed` is that of its message."""
+    end = (HEADER_2 if frame[0] == MAGIC_2 else HEADER_1) + frame[1]
+    return mcrf4xx(frame[1:end] + seed) == frame[end] | frame[end + 1] << 8
+
+
+def _seed(kind: Any) -> bytes:
+    return bytes((kind.crc_extra,))
+
+
 class Dialect:
     """The messages of one pymavlink dialect. Raises ConfigError where there is no such dialect."""
 
@@ -88,8 +101,8 @@ class Dialect:
         if name not in known:
             raise ConfigError(f"there is no MAVLink dialect '{name}'; known: {', '.join(known)}")
         self.name = name
-        self._module: ModuleType = importlib.import_module(f"pymavlink.dialects.v20.{name}")
-        self._types: dict[int, Any] = self._module.mavlink_map
+        self._types: dict[int, Any] = importlib.import_module(f"pymavlink.dialects.v20.{name}").mavlink_map
+        self._seeds = {number: _seed(kind) for number, kind in self._types.items()}
         self.ids: dict[str, int] = {kind.msgname: number for number, kind in self._types.items()}
 
     def type_of(self, message: str) -> Any:
@@ -98,15 +111,10 @@ class Dialect:
             raise ConfigError(f"the MAVLink dialect '{self.name}' has no message {message}")
         return self._types[self.ids[message]]
 
-    def sound(self, frame: Bytes) -> bool | None:
+    def sound(self, frame: bytes) -> bool | None:
         """Is the checksum right? None where the message, and so the seed of its checksum, is unknown."""
-        kind = self._types.get(message_id(frame))
-        if kind is None:
-            return None
-        end = HEADER_2 + frame[1] if frame[0] == MAGIC_2 else HEADER_1 + frame[1]
-        seed = bytes((kind.crc_extra,))
-        computed: int = self._module.x25crc(bytes(frame[1:end]) + seed).crc
-        return computed == frame[end] | frame[end + 1] << 8
+        seed = self._seeds.get(message_id(frame))
+        return None if seed is None else is_sound(frame, seed)
 
 
 class FrameSplitter:
@@ -148,7 +156,7 @@ class FrameSplitter:
         """Is this complete frame one? A message of unknown checksum is believed when it stands between frames; None
         says that this takes the next byte, which is not here yet."""
         end = at + length
-        sound = self._dialect.sound(self._buffer[at:end])
+        sound = self._dialect.sound(bytes(self._buffer[at:end]))
         if sound is not None:
             return sound
         if end < len(self._buffer):
@@ -162,6 +170,7 @@ class _Reader:
     def __init__(self, kind: Any, fields: tuple[str, ...]) -> None:
         self._unpack: Callable[[bytes], tuple[Any, ...]] = kind.unpacker.unpack
         self._size: int = kind.unpacker.size
+        self.seed = _seed(kind)
         self._pick = itemgetter(*(kind.ordered_fieldnames.index(name) for name in fields))
         self.is_sensor = kind.msgname not in (HEARTBEAT, SYSTEM_TIME)
         self.handlers: list[Callable[[tuple[Any, ...], int], list[Received]]] = []
@@ -169,8 +178,8 @@ class _Reader:
     def fields(self, frame: bytes) -> tuple[Any, ...]:
         """The fields asked for, of a frame whose checksum is right."""
         start = HEADER_2 if frame[0] == MAGIC_2 else HEADER_1
-        payload = frame[start : start + frame[1]]
-        picked: tuple[Any, ...] = self._pick(self._unpack(payload.ljust(self._size, b"\0")[: self._size]))
+        payload = frame[start : start + min(frame[1], self._size)]
+        picked: tuple[Any, ...] = self._pick(self._unpack(payload.ljust(self._size, b"\0")))
         return picked
 
 
@@ -199,6 +208,7 @@ class MavlinkDecoder:
         except ConfigError as error:
             raise ConfigError(f"mavlink.{link}.dialect: {error}") from error
         self._component = settings.component
+        self._boot_clock = boot_clock(link, self.system)
         self._sequences = {} if sequences is None else sequences
         self._last_counter: dict[int, int] = {}
         kinds = ("decoded", "skipped", "other systems", "other components", "other instances")
@@ -221,19 +231,20 @@ class MavlinkDecoder:
         if len(frame) < HEADER_1 + CHECKSUM or frame_length(frame) != len(frame):
             return "undecodable"
         if frame[0] == MAGIC_2:
-            counter, system, component = frame[4], frame[5], frame[6]
+            counter, system, component, low, high = SENDER_2.unpack_from(frame, 4)
+            number = low | high << 16
         else:
-            counter, system, component = frame[2], frame[3], frame[4]
+            counter, system, component, number = SENDER_1.unpack_from(frame, 2)
         if self._component not in (0, component):
             return "other components"
-        reader = self._readers.get(message_id(frame))
+        reader = self._readers.get(number)
         if system != self.system and not self._adopt(system, reader, frame):
             return "other systems"
-        if reader is not None and not self.dialect.sound(frame):
+        if reader is not None and not is_sound(frame, reader.seed):
             return "bad checksum"
         missing = (counter - self._last_counter.get(component, counter - 1) - 1) & 0xFF
         self._last_counter[component] = counter
-        if missing < LONGEST_GAP:
+        if 0 < missing < LONGEST_GAP:
             self.counts["lost"] += missing
         return "skipped" if reader is None else reader
 
@@ -247,6 +258,7 @@ class MavlinkDecoder:
         elif self.system != 0 or not reader.is_sensor:
             return False
         self.system = system
+        self._boot_clock = boot_clock(self.link, system)
         self._last_counter.clear()
         return True
 
@@ -278,18 +290,19 @@ class MavlinkDecoder:
         unix_us, boot_ms = fields
         if not CLOCK_SET_US <= unix_us < UNIX_UNTIL_US:
             return []
-        pair = ClockPair(boot_clock(self.link, self.system), boot_ms * 10**6)
+        pair = ClockPair(self._boot_clock, boot_ms * 10**6)
         return [self.event(f"{self.link}.time", (UNIX_CLOCK, unix_us * 1000), t_receive_ns, pair)]
 
     def event(self, source: str, stamp: tuple[str, int | None], t_receive_ns: int, payload: AnyPayload) -> Received:
         """The next event of a source. `stamp`: clock, sensor's stamp."""
         sequence = self._sequences[source] = self._sequences.get(source, -1) + 1
-        return Received(source, sequence, *stamp, t_receive_ns, payload)
+        clock, t_sensor_ns = stamp
+        return Received(source, sequence, clock, t_sensor_ns, t_receive_ns, payload)
 
     def stamp(self, time_us: int) -> tuple[str, int | None]:
         """Clock and stamp of a `time_usec` field, Unix or boot time by its magnitude; none where it is 0 or garbage."""
         if 0 < time_us < UNIX_FROM_US:
-            return boot_clock(self.link, self.system), time_us * 1000
+            return self._boot_clock, time_us * 1000
         if UNIX_FROM_US <= time_us < UNIX_UNTIL_US:
             return UNIX_CLOCK, time_us * 1000
         return "", None
@@ -324,12 +337,10 @@ class _ImuHandler:
             rate = (rate[0] / 1e3, rate[1] / 1e3, rate[2] / 1e3)
         elif fields[7] & ACCEL_AND_GYRO != ACCEL_AND_GYRO:
             return Invalid("not updated")
-        if not math.isfinite(sum(force) + sum(rate)):
-            return Invalid("not finite")
-        if max(force) > self._imu.accel_limit or min(force) < -self._imu.accel_limit:
-            return Invalid("beyond accel_limit")
-        if max(rate) > self._imu.gyro_limit or min(rate) < -self._imu.gyro_limit:
-            return Invalid("beyond gyro_limit")
+        calm, slow = _within(force, self._imu.accel_limit), _within(rate, self._imu.gyro_limit)
+        if not (calm and slow):
+            finite = math.isfinite(sum(force) + sum(rate))
+            return Invalid(("beyond gyro_limit" if calm else "beyond accel_limit") if finite else "not finite")
         if self._mat_bs is None:
             return ImuSample(force, rate)
         return ImuSample(_turn(self._mat_bs, force), _turn(self._mat_bs, rate))
@@ -369,6 +380,12 @@ class _GnssHandler:
 def _known(thousandths: int) -> float | None:
     """An accuracy of the extension fields, mm or mm/s: 0 is unknown."""
     return thousandths / 1e3 if thousandths else None
+
+
+def _within(vector: Vector3, limit: float) -> bool:
+    """Is every component finite, and at most `limit` in size?"""
+    x, y, z = vector
+    return -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit
 
 
 def _rotation(angles_deg: Vector3) -> tuple[Vector3, Vector3, Vector3]:

@@ -81,6 +81,7 @@ class _Verdict(Enum):
     SLOW = auto()
 
 
+FITS = _Verdict.FITS  # what nearly all stamps do
 _REASONS = {_Verdict.FUTURE: "stamped in the future", _Verdict.FALLEN: "clock jump"}
 _CONFIRMATION = {  # stamps in a row that agree, and the time which they span on both clocks
     _Verdict.FUTURE: (2, 0),
@@ -118,7 +119,8 @@ class _Piece:
     step: bool = False  # not joined to the piece before it
 
     def at(self, stamp: int) -> int:
-        return self.shift + max(0, min(stamp, self.end) - self.start) * self.rate // BILLION
+        elapsed = (stamp if stamp < self.end else self.end) - self.start
+        return self.shift + (elapsed * self.rate // BILLION if elapsed > 0 else 0)
 
 
 class _Aligner:
@@ -168,9 +170,11 @@ class _Aligner:
         piece = self._piece(stamp, receive)
         aligned = stamp + piece.at(stamp)
         late = receive - aligned
-        verdict = self._judge(stamp, late, self._usual.get(source, 0))
-        if verdict is _Verdict.FITS:
-            self._fits(source, late)
+        usual = self._usual.get(source, 0)
+        verdict = FITS if -FUTURE_TOLERANCE <= late <= SLOW else self._judge(stamp, late, usual)
+        if verdict is FITS:
+            if self._rows or late < usual:
+                self._fits(source, late)
         elif (agreed := self._agreed(verdict, source, stamp, receive, late)) is not None:
             self.resets += 1
             self._begin(stamp, receive, agreed)
@@ -179,7 +183,7 @@ class _Aligner:
         elif verdict in _REASONS:
             self.strays += 1
             return _REASONS[verdict]
-        if verdict is _Verdict.FITS or verdict is _Verdict.SLOW:
+        if verdict is FITS or verdict is _Verdict.SLOW:
             self._floor.add(receive, offset)
         if piece.step:
             self.resets += 1
@@ -219,7 +223,7 @@ class _Aligner:
         anchored = self.anchored
         excess = late if anchored else late - usual
         if excess <= PLAUSIBLE_LATENCY:
-            return _Verdict.FITS if anchored or excess <= SLOW else _Verdict.SLOW
+            return FITS if anchored or excess <= SLOW else _Verdict.SLOW
         return _Verdict.FALLEN if stamp < self._newest - usual - FALL else _Verdict.LATE
 
     def _fits(self, source: str, late: int) -> None:
@@ -295,21 +299,20 @@ class Clock:
         if isinstance(payload, ClockPair):
             self._learn(received, payload)
             return None
-        receive, stamp = received.t_receive_ns, received.t_sensor_ns
+        source, clock, receive, stamp = received.source, received.clock, received.t_receive_ns, received.t_sensor_ns
         placed: int | str = receive
-        if stamp is None or not received.clock:
+        if stamp is None or not clock:
             self._arrivals += 1
         elif stamp <= 0:
             placed = ABSURD
         elif isinstance(payload, Invalid):
-            placed = self._aligner(received.clock).peek(stamp, receive)
+            placed = self._aligner(clock).peek(stamp, receive)
         else:
-            placed = self._aligner(received.clock).place(received.source, stamp, receive)
+            placed = self._aligner(clock).place(source, stamp, receive)
         if isinstance(placed, str):
             payload = payload if isinstance(payload, Invalid) else Invalid(placed)
             placed = receive
-        placed -= self._delays.get(received.source, 0)
-        return Measurement(placed, received.source, received.sequence, receive, payload)
+        return Measurement(placed - self._delays.get(source, 0), source, received.sequence, receive, payload)
 
     def report(self) -> dict[str, ClockReport]:
         """How each clock is aligned, by name; "arrival" stands for what came without a stamp."""

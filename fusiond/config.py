@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Iterator
@@ -13,6 +14,9 @@ from msgspec import Meta, Struct, field
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
+Seconds = Annotated[float, Meta(gt=0, le=1_000_000)]
+Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
+Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="letters, digits, underscore")]
 Vector = tuple[float, float, float]
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
@@ -37,18 +41,18 @@ class Vehicle(Section, frozen=True, kw_only=True):
 class Filter(Section, frozen=True, kw_only=True):
     """[filter]: the estimator, its memory and how it starts."""
 
-    horizon_s: Positive = 1.0  # how late a measurement may be and still be put where it belongs
-    snapshot_interval_s: NotNegative = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
-    imu_gap_s: Positive = 0.2  # an IMU silent for longer is bridged by coasting at constant velocity
-    restart_gap_s: Positive = 30.0  # after a hole in the data of this length the filter aligns anew
+    horizon_s: Seconds = 1.0  # how late a measurement may be and still be put where it belongs
+    snapshot_interval_s: Span = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
+    imu_gap_s: Seconds = 0.2  # an IMU silent for longer is bridged by coasting at constant velocity
+    restart_gap_s: Seconds = 30.0  # after a hole in the data of this length the filter aligns anew
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
-    gnss_reset_s: Positive = 10.0  # GNSS rejected for this long without a break is believed again
+    gnss_reset_s: Seconds = 10.0  # GNSS rejected for this long without a break is believed again
     v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # given start heading, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
     course_speed_mps: Positive = 3.0  # above this GNSS speed its course gives the start heading
     level_sigma_deg: Positive = 3.0  # sigma of roll and pitch after leveling on the accelerometer
-    position_timeout_s: Positive = 2.0  # without a position fix for this long: dead reckoning
+    position_timeout_s: Seconds = 2.0  # without a position fix for this long: dead reckoning
     lost_sigma_m: Positive = 200.0  # horizontal position sigma beyond which the state is called lost
     wheel_scale_sigma: NotNegative = 0.01  # first sigma of the common wheel scale (1 = 100 %); 0 freezes it at zero
     wheel_scale_walk: NotNegative = 1e-5  # its random walk [1/sqrt(s)]
@@ -63,13 +67,13 @@ class Motion(Section, frozen=True, kw_only=True):
     point_m: Vector = (0.0, 0.0, 0.0)  # where it holds, from the IMU: the middle of the unsteered axle
     lateral_sigma_mps: Positive = 0.2  # how far the point may slip sideways: sigma of that constraint
     vertical_sigma_mps: Positive = 0.3  # likewise up and down: suspension
-    interval_s: Positive = 0.1  # spacing of constraint, zero velocity and zero rotation updates
+    interval_s: Seconds = 0.1  # spacing of constraint, zero velocity and zero rotation updates
     minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint rests below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
     still_wheel_mps: Positive = 0.1  # every wheel at or below this; so fast it may creep unseen
     still_gyro_deg_s: Positive = 0.6  # and the gyro's scatter below this
     still_accel_mps2: Positive = 0.25  # and the accelerometer's scatter below this
-    still_after_s: Positive = 0.5  # for this long
+    still_after_s: Seconds = 0.5  # for this long
     zero_velocity_sigma_mps: Positive = 0.02  # sigma of the velocity at standstill, per axis
     zero_rotation_sigma_deg_s: Positive = 0.1  # sigma of the angular rate at standstill, per axis
 
@@ -97,7 +101,7 @@ class Can(Section, frozen=True, kw_only=True):
     config_context: str | None = None  # section of python-can's own configuration file
     fd: bool = False  # CAN FD
     bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], where the interface does not set it
-    delay_ms: NotNegative = 0.0  # how old a frame is when it is received
+    delay_ms: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0  # how old a frame is when it is received
 
 
 class Imu(Section, frozen=True, kw_only=True):
@@ -108,7 +112,7 @@ class Imu(Section, frozen=True, kw_only=True):
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
     rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to ask the autopilot for, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
-    delay_ms: float = 0.0  # how long before its stamp the sample was true
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was true
     accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
     gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
     accel_bias_sigma: NotNegative = 0.3  # first sigma of the accelerometer bias [m/s^2]
@@ -125,8 +129,8 @@ class Gnss(Section, frozen=True, kw_only=True):
     link: Name  # the [mavlink.LINK] it comes by
     message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"  # the message that carries it
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
-    delay_ms: float = 0.0  # how long before its stamp the position was true
-    velocity_delay_ms: float = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the position was true
+    velocity_delay_ms: Milliseconds = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
     stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's own stamp, use the receipt less delay_ms
     position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and the least it is believed to be
     height_sigma_m: Positive = 3.0  # likewise, vertical
@@ -159,7 +163,7 @@ class Wheel(Section, frozen=True, kw_only=True):
     least_mps: NotNegative = 0.1  # slower than this it reads 0, or anything
     quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
     correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
-    delay_ms: float = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)
 
 
 class Publish(Section, frozen=True, kw_only=True):
@@ -256,6 +260,7 @@ def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
     for key in given:
         if key in table:
             raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: unknown key")
+    refuse([(key, "must be a finite number") for key in _not_finite(table)], text, path)
     try:
         return msgspec.convert(table | given, kind)
     except msgspec.ValidationError as error:
@@ -266,6 +271,18 @@ def refuse(complaints: list[tuple[str, str]], text: str, path: Path) -> None:
     """Raise ConfigError for the first of the complaints (dotted key, what is wrong), if there is one."""
     for key, complaint in complaints:
         raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
+
+
+def _not_finite(value: object, key: str = "") -> Iterator[str]:
+    """The dotted keys of the numbers, in a table or array of them, that TOML calls inf or nan."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _not_finite(inner, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        for place, inner in enumerate(value):
+            yield from _not_finite(inner, f"{key}[{place}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield key
 
 
 def _contradictions(config: Config) -> list[tuple[str, str]]:
@@ -286,10 +303,14 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
         refer("wheel", name, "bus", wheel.bus, config.can)
     found += _contradictions_on_can(config)
     if len(config.imu) != 1:
-        found.append(("imu", f"exactly one [imu.NAME] is needed, found {len(config.imu)}"))
-    names = [*config.imu, *config.gnss, *config.wheel]
-    for name in sorted({name for name in names if names.count(name) > 1}):
-        found.append((name, "names two sources; every source needs a name of its own"))
+        key = ".".join(["imu", *list(config.imu)[1:2]])
+        found.append((key, f"exactly one [imu.NAME] is needed, found {len(config.imu)}"))
+    taken: dict[str, str] = {}
+    for table, named in (("imu", config.imu), ("gnss", config.gnss), ("wheel", config.wheel)):
+        for name in named:
+            if name in taken:
+                found.append((f"{table}.{name}", f"[{taken[name]}.{name}] has this name; each source needs its own"))
+            taken.setdefault(name, table)
     if config.record.file_mb * 2 > config.record.total_mb:
         found.append(("record.total_mb", f"must be at least twice file_mb ({config.record.file_mb:g} MB)"))
     if config.filter.imu_gap_s >= config.filter.horizon_s:
@@ -315,7 +336,7 @@ def _explain(
     message: str, table: dict[str, object], text: str, path: Path, *, kind: type[Section], given: dict[str, object]
 ) -> str:
     """msgspec's complaint, with the file's line, the dotted key and the allowed keys."""
-    where = re.search(r" - at `(?:key in )?\$\.?(.*?)`$", message)
+    where = re.search(r" - at (?:`key` in )?`\$\.?(.*?)`$", message)
     inside = where.group(1) if where else ""
     what = message[: where.start()] if where else message
     key = _resolve(inside, message, table, kind)
@@ -328,7 +349,29 @@ def _explain(
     missing = re.search(r"missing required field `(\w+)`", message)
     if missing:
         what = f"the key '{missing.group(1)}' is missing"
+    if what.startswith("Invalid enum value"):
+        what += f"; allowed: {', '.join(_choices(kind, key))}"
+    if " at `key` in " in message:
+        entries = table[inside]
+        assert isinstance(entries, dict)
+        key = f"{inside}.{next(name for name in entries if not re.fullmatch('[A-Za-z0-9_]+', name))}"
+    if "matching regex" in what:
+        what = "a name is made of letters, digits and underscores"
     return f"{path}:{_line_of(key, text)}: {key or 'the file'}: {what}"
+
+
+def _choices(kind: type[Section], key: str) -> list[str]:
+    """The values that an enumerated key may have."""
+    *tables, last = key.split(".")
+    here = _kind_at(kind, tables)
+    types = {item.name: item.type for item in msgspec.structs.fields(here)} if here else {}
+    return [str(choice) for choice in _literals(types.get(last))]
+
+
+def _literals(hint: object) -> list[object]:
+    if get_origin(hint) is Literal:
+        return list(get_args(hint))
+    return [choice for inner in get_args(hint) for choice in _literals(inner)]
 
 
 def _resolve(inside: str, message: str, table: dict[str, object], kind: type[Section]) -> str:
@@ -377,7 +420,7 @@ def _line_of(key: str, text: str) -> int:
     for number, line in enumerate(text.splitlines(), 1):
         head = re.match(r"\s*(\[+)([^\]]+)\]", line)
         if head:
-            table = head.group(2).strip()
+            table = re.sub("[\"']", "", head.group(2).strip())
             if head.group(1) == "[[":
                 counts[table] = counts.get(table, -1) + 1
                 table = f"{table}[{counts[table]}]"

@@ -35,7 +35,8 @@ class OffsetFloor:
         self.slope = 0  # ppb
 
     def _rise(self, x: int) -> int:
-        return self.slope * min(x - self._origin, self._reach) // BILLION
+        span = x - self._origin
+        return self.slope * (span if span < self._reach else self._reach) // BILLION
 
     def at(self, x: int) -> int:
         """The line's value at x, or at its newest complete bucket where x lies before that."""
@@ -50,7 +51,7 @@ class OffsetFloor:
         height = y - self._rise(x)
         if complete or height < self._bucket_height:
             self._bucket, self._bucket_height = (x, y), height
-        self._least = min(self._least, height)
+            self._least = min(self._least, height)
 
     def _close(self, x: int) -> None:
         points = self._points

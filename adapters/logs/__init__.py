@@ -1,7 +1,8 @@
 """Readers of recorded logs, one file per format, and the merge of several logs into one stream.
 
-A reader is a generator of `Received` over one `LogInput`. What it meets on the way (bad lines, a cut tail) is counted
-in `LogInput.counts`; only a file that cannot be a log of its format at all raises, and then `LogError`.
+A reader is a generator over one `LogInput` that yields the events of each frame as a list. What it meets on the way (bad
+lines, a cut tail) is counted in `LogInput.counts`; only a file that cannot be a log of its format at all raises, and then
+`LogError`.
 """
 
 from __future__ import annotations

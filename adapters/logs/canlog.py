@@ -21,6 +21,7 @@ import re
 import sqlite3
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import chain, islice
 from typing import NamedTuple
@@ -42,6 +43,9 @@ UNZIPPED_ONLY = (".db", ".mf4")
 LINE = re.compile(
     rb"\s*\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"  # (seconds.fraction) channel id
     rb"#(?:#[0-9A-Fa-f])?([0-9A-Fa-f]*|[Rr][0-9A-Fa-f]?)(?:\s+[RTrt])?\s*"  # #data, ##flags data, or #R
+)
+PLAIN = (  # lines as candump itself writes them, of data frames whose ids are not among those at %b
+    rb"(?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*\n)++"
 )
 LONGEST_LINE = 1 << 16  # bytes; more without a line's end is no text
 ERROR_FLAG, ID_BITS = 0x20000000, 0x1FFFFFFF  # in the 8-digit ids of candump
@@ -65,8 +69,8 @@ class _Frame(NamedTuple):
 
 def read_can_log(
     log: LogInput, decoders: Mapping[str, CanDecoder], config: Config, *, named: bool = False
-) -> Iterator[Received]:
-    """The wheel speeds in a CAN log, in the order of the file.
+) -> Iterator[list[Received]]:
+    """The wheel speeds in a CAN log, frame by frame in the order of the file.
 
     `decoders`: by bus, those that may be in this log. `named`: the log was given as that of the only one of them.
     Raises LogError where nothing in the file is a CAN frame, or no bus can be told from its channels.
@@ -80,7 +84,7 @@ def read_can_log(
         if decoder is None:
             log.counts["other channels"] += 1
         else:
-            yield from decoder.decode(arbitration_id, is_extended, data, t_ns)
+            yield decoder.decode(arbitration_id, is_extended, data, t_ns)
     if not log.counts["frames"]:
         kind = "`candump -L`" if log.suffix == ".log" else (TEXT | BINARY)[log.suffix]
         raise LogError(f"{log.path}: no CAN frame in it; is it a {kind} log?")
@@ -113,43 +117,68 @@ def _assign(
 
 
 def _candump(log: LogInput, keys: frozenset[int]) -> Iterator[_Frame]:
-    """The frames of a `candump -L` log whose ids are wanted."""
+    """The frames of a `candump -L` log whose ids are wanted. Most lines of a log are of other ids: stretches of them are
+    passed over in one step."""
     wanted = {b"%03X" % key if key <= 0x7FF else b"%08X" % (key & ID_BITS): key for key in keys}
+    others = re.compile(PLAIN % (b"|".join(wanted) or b"-"))  # no id begins with a dash
     counts = log.counts
-    match = LINE.fullmatch
-    for line in _lines(log):
-        found = match(line)
-        if found is None:
-            counts["bad lines"] += bool(line.strip())
-            continue
-        counts["frames"] += 1
-        seconds, fraction, channel, digits, content = found.groups()
-        key = wanted.get(digits) or wanted.get(digits.upper())
-        if key is None:
-            error = len(digits) == 8 and int(digits, 16) & ERROR_FLAG
-            counts["error frames" if error else "other ids"] += 1
-        elif content[:1] in (b"R", b"r"):
-            counts["remote frames"] += 1
-        elif len(content) % 2:
-            counts["frames"] -= 1
-            counts["bad lines"] += 1
-        else:
-            t_ns = int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
-            data = bytes.fromhex(content.decode("ascii"))
-            yield _Frame(t_ns, channel.decode("utf-8", "replace"), key & ID_BITS, len(digits) == 8, data)
+    for text in _whole_lines(log):
+        at = 0
+        while at < len(text):
+            stretch = others.match(text, at)
+            if stretch is not None:
+                passed = text.count(b"\n", at, stretch.end())
+                counts["frames"] += passed
+                counts["other ids"] += passed
+                at = stretch.end()
+                continue
+            end = text.index(b"\n", at) + 1
+            frame = _frame(text[at:end], wanted, counts)
+            if frame is not None:
+                yield frame
+            at = end
 
 
-def _lines(log: LogInput) -> Iterator[bytes]:
-    """The lines of a text log, in bounded memory."""
+def _frame(line: bytes, wanted: Mapping[bytes, int], counts: Counter[str]) -> _Frame | None:
+    """The frame in a line, if its id is wanted, by digits. Everything is counted."""
+    found = LINE.fullmatch(line)
+    if found is None:
+        counts["bad lines"] += bool(line.strip())
+        return None
+    seconds, fraction, channel, digits, content = found.groups()
+    key = wanted.get(digits) or wanted.get(digits.upper())
+    remote = content[:1] in (b"R", b"r")
+    if key is not None and not remote and len(content) % 2:
+        counts["bad lines"] += 1
+        return None
+    counts["frames"] += 1
+    if key is None:
+        error = len(digits) == 8 and int(digits, 16) & ERROR_FLAG
+        counts["error frames" if error else "other ids"] += 1
+        return None
+    if remote:
+        counts["remote frames"] += 1
+        return None
+    t_ns = int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
+    data = bytes.fromhex(content.decode("ascii"))
+    return _Frame(t_ns, channel.decode("utf-8", "replace"), key & ID_BITS, len(digits) == 8, data)
+
+
+def _whole_lines(log: LogInput) -> Iterator[bytes]:
+    """A text log in pieces that end where a line ends, in bounded memory."""
     rest = b""
     for block in log.blocks():
-        lines = (rest + block).split(b"\n")
-        rest = lines.pop()
-        yield from lines
+        head, end, tail = block.rpartition(b"\n")
+        if end:
+            yield rest + head + end
+            rest = tail
+        else:
+            rest += tail
         if len(rest) > LONGEST_LINE:
             log.counts["bad lines"] += 1
             rest = b""
-    yield rest
+    if rest:
+        yield rest + b"\n"
 
 
 def _python_can(log: LogInput, keys: frozenset[int]) -> Iterator[_Frame]:

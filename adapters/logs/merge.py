@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 
@@ -50,7 +51,8 @@ class LogSet:
             raise RuntimeError("a LogSet is read once")
         self._begun = True
         placed = (log.placed() for log in self._logs)
-        return map(itemgetter(1), heapq.merge(*placed, key=itemgetter(0)))
+        frames = map(itemgetter(1), heapq.merge(*placed, key=itemgetter(0)))
+        return chain.from_iterable(frames)
 
     @property
     def bytes_total(self) -> int:
@@ -84,7 +86,7 @@ class _Log:
     """One log, its decoders, and the stamps seen in it."""
 
     def __init__(
-        self, file: LogInput, decoders: Sequence[MavlinkDecoder | CanDecoder], events: Iterator[Received]
+        self, file: LogInput, decoders: Sequence[MavlinkDecoder | CanDecoder], frames: Iterator[list[Received]]
     ) -> None:
         self.file = file
         self.is_mavlink = isinstance(decoders[0], MavlinkDecoder)
@@ -92,21 +94,23 @@ class _Log:
         self.last_ns = 0
         self.barren = False  # read to its end without an event
         self._decoders = decoders
-        self._events = events
+        self._frames = frames  # the events of each
 
-    def placed(self) -> Iterator[tuple[int, Received]]:
-        """The events, each with the greatest receive stamp so far."""
+    def placed(self) -> Iterator[tuple[int, list[Received]]]:
+        """The events of each frame, with the greatest receive stamp so far."""
         latest_ns: int | None = None
-        for event in self._events:
-            t_ns = event.t_receive_ns
+        for events in self._frames:
+            if not events:
+                continue
+            t_ns = events[0].t_receive_ns
             if latest_ns is None or self.first_ns is None:
                 latest_ns = self.first_ns = self.last_ns = t_ns
             elif t_ns >= latest_ns:
                 latest_ns = self.last_ns = t_ns
             else:
                 self.first_ns = min(self.first_ns, t_ns)
-                self.file.counts["stamps run back"] += 1
-            yield latest_ns, event
+                self.file.counts["stamps run back"] += len(events)
+            yield latest_ns, events
         self.barren = latest_ns is None
         self.file.bytes_read = self.file.bytes_total
 

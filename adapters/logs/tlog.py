@@ -19,17 +19,19 @@ from ..mavlink import LENGTH_KNOWN, LONGEST_FRAME, MAGIC, MAGIC_1, MAGIC_2, Dial
 from . import LogError, LogInput
 
 STAMP = Struct(">Q")  # microseconds of Unix time
+STAMP_SIZE = STAMP.size
+MAGICS = (MAGIC_1, MAGIC_2)
 STAMP_UNTIL_US = 4_102_444_800 * 10**6  # 2100
 RESYNC_REACH_US = 366 * 86_400 * 10**6  # a record found after garbage is stamped within a year of the one before
 STEP_US = 10**6  # a stamp that jumps by more is compared with the next one
-REACH = 2 * (STAMP.size + LONGEST_FRAME)  # bytes in which a whole record and the next one's beginning lie
+REACH = 2 * (STAMP_SIZE + LONGEST_FRAME)  # bytes in which a whole record and the next one's beginning lie
 
 
-def read_tlog(log: LogInput, decoder: MavlinkDecoder) -> Iterator[Received]:
-    """The events of a .tlog in the order of the file. Raises LogError where there is no MAVLink in it."""
+def read_tlog(log: LogInput, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
+    """The events of a .tlog, frame by frame in the order of the file. Raises LogError where there is no MAVLink in it."""
     decode = decoder.decode
     for stamp_us, frame in _Records(log, decoder.dialect):
-        yield from decode(frame, stamp_us * 1000)
+        yield decode(frame, stamp_us * 1000)
     if not log.counts["records"]:
         raise LogError(f"{log.path}: no MAVLink frame in it; is it a .tlog?")
 
@@ -64,12 +66,14 @@ class _Records:
                 skipped += start - at
                 at = start
                 continue
-            counts["bad bytes"] += skipped
-            skipped, cut, self._in_step = 0, False, True
+            if skipped:
+                counts["bad bytes"] += skipped
+                skipped = 0
+            cut, self._in_step = False, True
             counts["records"] += 1
             stamp_us: int = STAMP.unpack_from(self._buffer, at)[0]
             if self._stamp_is_good(stamp_us, at + size):
-                yield stamp_us, self._buffer[at + STAMP.size : at + size]
+                yield stamp_us, self._buffer[at + STAMP_SIZE : at + size]
             at += size
         if cut:
             counts["truncated tail"] += 1
@@ -90,16 +94,16 @@ class _Records:
 
     def _record_size(self, at: int) -> int:
         """Bytes of the record that begins at `at`; 0 where none does."""
-        buffer = self._buffer
-        start = at + STAMP.size
-        if len(buffer) < start + LENGTH_KNOWN:
+        buffer, size = self._buffer, len(self._buffer)
+        start = at + STAMP_SIZE
+        if size < start + LENGTH_KNOWN:
             return 0
         length = frame_length(buffer, start)
         end = start + length
-        if not length or end > len(buffer):
+        if not length or end > size:
             return 0
-        next_magic = end + STAMP.size
-        goes_on = buffer[next_magic] in (MAGIC_1, MAGIC_2) if next_magic < len(buffer) else end == len(buffer)
+        next_magic = end + STAMP_SIZE
+        goes_on = buffer[next_magic] in MAGICS if next_magic < size else end == size
         if self._in_step and goes_on:
             return end - at
         sound = self._dialect.sound(buffer[start:end])
@@ -115,7 +119,7 @@ class _Records:
 
     def _is_cut(self, at: int) -> bool:
         """Does the file end inside the record at `at`?"""
-        start = at + STAMP.size
+        start = at + STAMP_SIZE
         if not self._ended or len(self._buffer) < start + LENGTH_KNOWN:
             return self._ended
         length = frame_length(self._buffer, start)
@@ -123,10 +127,10 @@ class _Records:
 
     def _next_candidate(self, at: int) -> int:
         """Where the next record may begin, after `at`."""
-        found = MAGIC.search(self._buffer, at + STAMP.size + 1)
+        found = MAGIC.search(self._buffer, at + STAMP_SIZE + 1)
         if found:
-            return found.start() - STAMP.size
-        return len(self._buffer) if self._ended else max(at + 1, len(self._buffer) - STAMP.size)
+            return found.start() - STAMP_SIZE
+        return len(self._buffer) if self._ended else max(at + 1, len(self._buffer) - STAMP_SIZE)
 
     def _stamp_is_good(self, stamp_us: int, following: int) -> bool:
         """Compare a stamp with the last one and, where it jumps, with that of the record at `following`."""
@@ -148,8 +152,8 @@ class _Records:
 
     def _stamp_at(self, at: int) -> int | None:
         """The stamp of the record at `at`, if there is one."""
-        magic = at + STAMP.size
-        if magic >= len(self._buffer) or self._buffer[magic] not in (MAGIC_1, MAGIC_2):
+        magic = at + STAMP_SIZE
+        if magic >= len(self._buffer) or self._buffer[magic] not in MAGICS:
             return None
         stamp_us: int = STAMP.unpack_from(self._buffer, at)[0]
         return stamp_us

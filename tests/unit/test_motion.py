@@ -20,6 +20,7 @@ from fusiond.state import (
     T_STILL,
     VELOCITY_E,
 )
+from tests.conftest import needs_compiled
 from tests.streams import SECOND, T0, Drive, config, drive, fuse, measurements
 
 BIAS = (0.004, -0.003, 0.005)  # rad/s
@@ -131,7 +132,8 @@ def test_zero_rotation_finds_the_gyro_bias(compiled: bool) -> None:
     assert sigmas[0] < sigmas[1] / 3
 
 
-def test_non_holonomic_constraint_bounds_the_lateral_drift(compiled: bool) -> None:
+@needs_compiled
+def test_non_holonomic_constraint_bounds_the_lateral_drift() -> None:
     """Without GNSS the wheels know how far, the constraint knows where to."""
     truth = drive(30.0, lambda t: 15.0 + 0 * t, lambda t: 0.4 + 0 * t, rate=50.0)
     misses = []
@@ -142,7 +144,7 @@ def test_non_holonomic_constraint_bounds_the_lateral_drift(compiled: bool) -> No
             if not isinstance(event.payload, GnssPosition | GnssVelocity) or event.t_ns < T0 + 8 * SECOND
         ]
         motion = {"non_holonomic": used, "standstill": False}
-        head = fuse(config(filter=FACING, motion=motion), events, compiled).history.head
+        head = fuse(config(filter=FACING, motion=motion), events, True).history.head
         off = truth.mat_eb[-1].T @ (head.nominal[POSITION_E] - truth.position_e[-1])
         misses.append(abs(off[1]))
     assert misses[0] < 3.0  # of 330 m
