@@ -10,7 +10,7 @@ says what was taken. A given `log_channel` forbids that, unless the bus is named
 has no channels. What no bus takes is counted; if that is all of the first wheel frames, it is an error.
 
 Counts: `frames` (all readable ones), `other ids`, `other channels`, `error frames`, `remote frames`, `bad lines`,
-`unreadable tail` (the rest of a damaged binary log).
+`unreadable tail` (the rest of a damaged binary log), `bad stamps` (wheel frames dropped for their stamp).
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ PLAIN = (  # lines as candump itself writes them, of data frames whose ids are n
 LONGEST_LINE = 1 << 16  # bytes; more without a line's end is no text
 ERROR_FLAG, ID_BITS = 0x20000000, 0x1FFFFFFF  # in the 8-digit ids of candump
 MF4_MAGIC = (b"MDF", b"UnFinMF")
+STEP_NS = 1_000_000_000  # a stamp that jumps by more is compared with the next one
 DECISION = 100  # wheel frames that the choice of channels looks at
 
 # What python-can's readers are known to raise on content that is not of their format.
@@ -76,7 +77,7 @@ def read_can_log(
     Raises LogError where nothing in the file is a CAN frame, or no bus can be told from its channels.
     """
     keys = frozenset().union(*(decoder.keys for decoder in decoders.values()))
-    frames = _candump(log, keys) if log.suffix == ".log" else _python_can(log, keys)
+    frames = _without_strays(_candump(log, keys) if log.suffix == ".log" else _python_can(log, keys), log)
     head = list(islice(frames, DECISION))
     buses = _assign(log, [frame.channel for frame in head], decoders, config, named=named)
     for t_ns, channel, arbitration_id, is_extended, data in chain(head, frames):
@@ -88,6 +89,24 @@ def read_can_log(
     if not log.counts["frames"]:
         kind = "`candump -L`" if log.suffix == ".log" else (TEXT | BINARY)[log.suffix]
         raise LogError(f"{log.path}: no CAN frame in it; is it a {kind} log?")
+
+
+def _without_strays(frames: Iterator[_Frame], log: LogInput) -> Iterator[_Frame]:
+    """The frames but those whose stamp jumps away from the one before while the next is back: a damaged digit, which would
+    hold up everything after it. A stamp that others follow is a clock that was set."""
+    last_ns: int | None = None
+    held: _Frame | None = None
+    for frame in frames:
+        if held is not None:
+            jump_ns = 0 if last_ns is None else abs(held.t_ns - last_ns)
+            if jump_ns > STEP_NS and last_ns is not None and abs(frame.t_ns - held.t_ns) > abs(frame.t_ns - last_ns):
+                log.counts["bad stamps"] += 1
+            else:
+                last_ns = held.t_ns
+                yield held
+        held = frame
+    if held is not None:
+        yield held
 
 
 def _assign(

@@ -254,6 +254,17 @@ def test_candump_stamps_are_exact(tmp_path: Path) -> None:
     assert stamps(found[::4]) == [1_700_000_000_123_456_000, 1_700_000_000_123_456_789]
 
 
+def test_a_can_stamp_gone_astray_costs_one_frame(tmp_path: Path) -> None:
+    path = written(tmp_path / "drive.log")
+    lines = path.read_text().splitlines()
+    wheel = [place for place, line in enumerate(lines) if " 0AA#" in line and "#R" not in line][7]
+    lines[wheel] = lines[wheel].replace("(1", "(2", 1)  # decades ahead
+    path.write_text("\n".join(lines) + "\n")
+    found, counts = events(path)
+    assert (len(found), counts["bad stamps"]) == (4 * 39, 1)
+    assert stamps(found) == sorted(stamps(found))
+
+
 def test_candump_in_all_its_forms_and_with_bad_lines(tmp_path: Path) -> None:
     path = tmp_path / "drive.log"
     lines = CANDUMP.splitlines()
