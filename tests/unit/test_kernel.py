@@ -214,6 +214,20 @@ def test_infinitely_correlated_samples_tell_nothing() -> None:
     np.testing.assert_allclose(one.history.head.nominal[3:], two.history.head.nominal[3:], rtol=1e-15)
 
 
+@pytest.mark.parametrize(("apart_ms", "coasts"), [(200, False), (201, True)])
+def test_imu_samples_too_far_apart_are_not_interpolated(apart_ms: int, coasts: bool) -> None:
+    rng = np.random.default_rng(8)
+    settings = config(filter={"imu_gap_s": 0.2}, motion={"non_holonomic": False, "standstill": False})
+    state = running_state(rng)
+    state.stamps[T_IMU] = T0
+    wheel = Measurement(T0 + 100 * MS, "front_left", 0, T0, WheelSpeed(500.0))  # rejected: it only carries the state on
+    fusion, _ = both(settings, state, [wheel, sample(T0 + apart_ms * MS, rng)])
+    head = fusion.history.head
+    expected = state.nominal[POSITION_E] + state.nominal[VELOCITY_E] * apart_ms / 1e3
+    assert bool(np.abs(head.nominal[POSITION_E] - expected).max() < 1e-8) is coasts
+    assert bool((head.nominal[QUATERNION_EB] == state.nominal[QUATERNION_EB]).all()) is coasts
+
+
 @pytest.mark.parametrize("kind", ["position", "velocity", "velocity 2-D"])
 def test_reset_after_a_long_rejection(kind: str) -> None:
     settings = config(filter={"gnss_reset_s": 5.0}, gnss={"lever_arm_m": (0.4, -0.2, -1.1)})
