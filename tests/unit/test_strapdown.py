@@ -82,9 +82,11 @@ class Path:
         return state
 
     def drive(self, kernel: AnyKernel, seconds: float, dt: float) -> FilterState:
-        state = self.state()
+        state, felt = self.state(), self.felt(dt / 2)
         for k in range(round(seconds / dt)):
-            kernel.propagate(state, dt, *self.felt((k + 0.5) * dt))
+            if self.speed:
+                felt = self.felt((k + 0.5) * dt)
+            kernel.propagate(state, dt, *felt)
         return state
 
     def miss(self, state: FilterState, second: float) -> tuple[float, float, float]:
