@@ -15,8 +15,9 @@ from typing import Any, TypeVar
 import cantools
 from cantools.database.can import Database, Message
 
-from fusiond.config import Config, ConfigError, Wheel
+from fusiond.config import Config, Wheel
 from fusiond.measurements import AnyPayload, Invalid, Received, WheelSpeed
+from fusiond.toml_file import ConfigError
 
 Item = TypeVar("Item")
 

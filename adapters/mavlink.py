@@ -24,7 +24,7 @@ from typing import Any
 import pymavlink.dialects.v20 as dialects
 from fastcrc.crc16 import mcrf4xx
 
-from fusiond.config import Config, ConfigError, Gnss, Imu
+from fusiond.config import Config, Gnss, Imu
 from fusiond.measurements import (
     UNIX_CLOCK,
     AnyPayload,
@@ -37,6 +37,7 @@ from fusiond.measurements import (
     Vector3,
     boot_clock,
 )
+from fusiond.toml_file import ConfigError
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 MAGIC = re.compile(b"[\xfd\xfe]")

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from threading import Event
 
-from fusiond.config import Config, ConfigError
+from fusiond.config import Config
 from fusiond.measurements import Received
+from fusiond.toml_file import ConfigError
 
 from .host_clock import HostClock
 from .inputs import POLL_S, Inbox, InputLost

@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import msgspec
 from msgspec import Meta
 
-from fusiond.config import Config, Name, Section
+from fusiond.config import Config
 from fusiond.simulation.scenario import Scenario
+from fusiond.toml_file import Name, Section
 
 FOLDER = Path(__file__).parent
 PAGES: dict[str, tuple[type[Section], frozenset[str]]] = {  # page: the whole file's struct, fields that are no keys

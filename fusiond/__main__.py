@@ -13,10 +13,10 @@ from pathlib import Path
 
 from fusiond import __version__, config, demo, report
 from fusiond.comparison import TruthError, Window
-from fusiond.config import ConfigError
 from fusiond.describe import description, oddities
 from fusiond.replay import Options, OutputError, UsageError, parse_interval, parse_withheld, replay
 from fusiond.simulation import scenario
+from fusiond.toml_file import ConfigError
 from fusiond_adapters.can import CanDecoder
 from fusiond_adapters.logs import LogError
 from fusiond_adapters.logs.write import write_drive

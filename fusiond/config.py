@@ -1,35 +1,24 @@
-"""The configuration: TOML to typed, frozen structs; an error names the file, the line, the key and what is allowed."""
+"""The configuration: what its tables may hold, and what may not stand together."""
 
 from __future__ import annotations
 
-import math
-import re
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Literal
 
-import msgspec
-from msgspec import Meta, Struct, field
+from msgspec import Meta, field
+
+from fusiond.toml_file import Name, Section, decode, read_text, refuse
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Seconds = Annotated[float, Meta(gt=0, le=1_000_000)]
 Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
 Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="letters, digits, underscore")]
 Vector = tuple[float, float, float]
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 Encoding = Literal["json", "msgpack"]
 ImuMessage = Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"]
-
-
-class ConfigError(Exception):
-    """The configuration cannot be used; the message says where and why."""
-
-
-class Section(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A TOML table: unknown keys are errors."""
 
 
 class Vehicle(Section, frozen=True, kw_only=True):
@@ -231,58 +220,11 @@ def load(file: str | Path) -> Config:
     return parse(read_text(path), path)
 
 
-def read_text(path: Path) -> str:
-    """The text of a file. Raises ConfigError."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text") from error
-
-
 def parse(text: str, path: Path = Path("config.toml")) -> Config:
     """Check the text of a configuration file; `path` serves for messages and relative names. Raises ConfigError."""
     config = decode(text, path, Config, directory=str(path.parent))
     refuse(_contradictions(config), text, path)
     return config
-
-
-Table = TypeVar("Table", bound=Section)
-
-
-def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
-    """Check the text of a TOML file against a struct; `given` are fields no file may set. Raises ConfigError."""
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    for key in given:
-        if key in table:
-            raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: unknown key")
-    refuse([(key, "must be a finite number") for key in _not_finite(table)], text, path)
-    try:
-        return msgspec.convert(table | given, kind)
-    except msgspec.ValidationError as error:
-        raise ConfigError(_explain(str(error), table, text, path, kind=kind, given=given)) from error
-
-
-def refuse(complaints: list[tuple[str, str]], text: str, path: Path) -> None:
-    """Raise ConfigError for the first of the complaints (dotted key, what is wrong), if there is one."""
-    for key, complaint in complaints:
-        raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
-
-
-def _not_finite(value: object, key: str = "") -> Iterator[str]:
-    """The dotted keys of the numbers, in a table or array of them, that TOML calls inf or nan."""
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from _not_finite(inner, f"{key}.{name}" if key else name)
-    elif isinstance(value, list):
-        for place, inner in enumerate(value):
-            yield from _not_finite(inner, f"{key}[{place}]")
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield key
 
 
 def _contradictions(config: Config) -> list[tuple[str, str]]:
@@ -330,107 +272,3 @@ def _contradictions_on_can(config: Config) -> Iterator[tuple[str, str]]:
                 yield f"can.{name}.dbc", f"no such file: {config.path(dbc)}"
         if not can.dbc and any(wheel.bus == name for wheel in config.wheel.values()):
             yield f"can.{name}", 'its wheels need a DBC file: dbc = ["FILE.dbc"]'
-
-
-def _explain(
-    message: str, table: dict[str, object], text: str, path: Path, *, kind: type[Section], given: dict[str, object]
-) -> str:
-    """msgspec's complaint, with the file's line, the dotted key and the allowed keys."""
-    where = re.search(r" - at (?:`key` in )?`\$\.?(.*?)`$", message)
-    inside = where.group(1) if where else ""
-    what = message[: where.start()] if where else message
-    key = _resolve(inside, message, table, kind)
-    unknown = re.search(r"unknown field `(\w+)`", message)
-    if unknown:
-        here = _kind_at(kind, key.split(".") if key else [])
-        allowed = sorted(set(here.__struct_fields__) - set(given)) if here else []
-        key = f"{key}.{unknown.group(1)}" if key else unknown.group(1)
-        what = f"unknown key; allowed: {', '.join(allowed)}"
-    missing = re.search(r"missing required field `(\w+)`", message)
-    if missing:
-        what = f"the key '{missing.group(1)}' is missing"
-    if what.startswith("Invalid enum value"):
-        what += f"; allowed: {', '.join(_choices(kind, key))}"
-    if " at `key` in " in message:
-        entries = table[inside]
-        assert isinstance(entries, dict)
-        key = f"{inside}.{next(name for name in entries if not re.fullmatch('[A-Za-z0-9_]+', name))}"
-    if "matching regex" in what:
-        what = "a name is made of letters, digits and underscores"
-    return f"{path}:{_line_of(key, text)}: {key or 'the file'}: {what}"
-
-
-def _choices(kind: type[Section], key: str) -> list[str]:
-    """The values that an enumerated key may have."""
-    *tables, last = key.split(".")
-    here = _kind_at(kind, tables)
-    types = {item.name: item.type for item in msgspec.structs.fields(here)} if here else {}
-    return [str(choice) for choice in _literals(types.get(last))]
-
-
-def _literals(hint: object) -> list[object]:
-    if get_origin(hint) is Literal:
-        return list(get_args(hint))
-    return [choice for inner in get_args(hint) for choice in _literals(inner)]
-
-
-def _resolve(inside: str, message: str, table: dict[str, object], kind: type[Section]) -> str:
-    """msgspec writes `[...]` for a table's name: find the name whose content has the fault."""
-    if "[...]" not in inside:
-        return inside
-    head, tail = inside.split("[...]", 1)
-    entries = table.get(head)
-    inner = _kind_at(kind, [head, "NAME"])
-    if isinstance(entries, dict) and inner is not None:
-        for name, entry in entries.items():
-            try:
-                msgspec.convert({name: entry}, dict[Name, inner])  # type: ignore[valid-type]
-            except msgspec.ValidationError as error:
-                if str(error) == message.replace(f"$.{head}[...]", "$[...]"):
-                    return f"{head}.{name}{tail}"
-    return head
-
-
-def _kind_at(kind: type[Section], parts: list[str]) -> type[Section] | None:
-    """The struct whose keys may stand below a dotted key, through arrays of tables and tables of named tables."""
-    here: type[Section] | None = kind
-    named = False
-    for part in parts:
-        if named:
-            named = False
-            continue
-        types = {item.name: item.type for item in msgspec.structs.fields(here)} if here else {}
-        here, named = _section_in(types.get(part.split("[")[0]))
-    return here
-
-
-def _section_in(hint: object) -> tuple[type[Section] | None, bool]:
-    """The struct inside a field's type, and whether it stands in a table of named tables."""
-    if isinstance(hint, type) and issubclass(hint, Section):
-        return hint, False
-    found = [inner for inner, _ in map(_section_in, get_args(hint)) if inner is not None]
-    return (found[0], get_origin(hint) is dict) if found else (None, False)
-
-
-def _line_of(key: str, text: str) -> int:
-    """The line on which a dotted key, or else the nearest table above it, stands; 1 if none does."""
-    parts = key.split(".")
-    table, best, depth = "", 1, 0
-    counts: dict[str, int] = {}  # of the tables in an array so far
-    for number, line in enumerate(text.splitlines(), 1):
-        head = re.match(r"\s*(\[+)([^\]]+)\]", line)
-        if head:
-            table = re.sub("[\"']", "", head.group(2).strip())
-            if head.group(1) == "[[":
-                counts[table] = counts.get(table, -1) + 1
-                table = f"{table}[{counts[table]}]"
-            shared = len([1 for a, b in zip(table.split("."), parts, strict=False) if a == b])
-            if key.startswith(table) and shared > depth:
-                best, depth = number, shared
-            continue
-        assigned = re.match(r"\s*([\w.\-]+)\s*=", line)
-        if assigned:
-            full = f"{table}.{assigned.group(1)}" if table else assigned.group(1)
-            if full == key or key.startswith(full + "["):
-                return number
-    return best

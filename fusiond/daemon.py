@@ -16,10 +16,11 @@ from contextlib import ExitStack
 from threading import Event
 from typing import Any
 
-from fusiond.config import Config, ConfigError
+from fusiond.config import Config
 from fusiond.live import LiveEngine
 from fusiond.messages import StateMessage
 from fusiond.reload import changes
+from fusiond.toml_file import ConfigError
 from fusiond_adapters.can_bus import CanBus
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.inputs import Inbox, InputLost, LiveInput

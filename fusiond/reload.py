@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from fusiond.config import Config, Section
+from fusiond.config import Config
+from fusiond.toml_file import Section
 
 LIVE_MAVLINK = frozenset({"connection", "baud", "own_system", "own_component", "request"})
 LIVE_CAN = frozenset({"interface", "channel", "config_context", "fd", "bitrate"})

@@ -13,7 +13,8 @@ from typing import Annotated, Literal, get_args
 
 from msgspec import Meta, field
 
-from fusiond.config import Name, NotNegative, Positive, Section, Vector, decode, read_text, refuse
+from fusiond.config import NotNegative, Positive, Vector
+from fusiond.toml_file import Name, Section, decode, read_text, refuse
 
 Degrees = Annotated[float, Meta(ge=-360, le=360)]
 Interval = tuple[float, float]  # [start, stop) s

@@ -12,10 +12,10 @@ import pytest
 from pymavlink import mavutil
 
 from fusiond import config
-from fusiond.config import ConfigError
 from fusiond.measurements import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, WheelSpeed
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import WHEELS, Scenario, load, parse
+from fusiond.toml_file import ConfigError
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
 
