@@ -12,10 +12,12 @@ OLDEST_NS = 2_000_000_000  # a kernel stamp older than this at its reading is no
 
 
 class HostClock:
-    """Stamps of receipt. One for all the inputs of a run."""
+    """Stamps of receipt. One for all the inputs of a run; `start_ns` lets a played drive have its own time."""
 
-    def __init__(self) -> None:
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+    speed = 1.0  # how many times as fast as time it runs
+
+    def __init__(self, start_ns: int | None = None) -> None:
+        self._offset_ns = (time.time_ns() if start_ns is None else start_ns) - time.monotonic_ns()
 
     def now_ns(self) -> int:
         """The present instant."""

@@ -7,10 +7,19 @@ another output. When the outbox of an output is full the oldest message is dropp
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from threading import Condition, Event
-from typing import Protocol
+from typing import Any, Protocol
 
-from fusiond.messages import Message
+from fusiond.config import Config
+from fusiond.latency import RecentLatencies
+from fusiond.messages import Message, StateMessage
+
+from .host_clock import HostClock
+from .inputs import LiveInput
+
+POLL_S = 0.2  # how long an output's thread waits for messages before it looks whether it is to stop
 
 
 class OutputLost(Exception):
@@ -23,9 +32,17 @@ class Outbox:
     def __init__(self, size: int, wants: tuple[type[Message], ...]) -> None:
         """`wants` are the kinds of messages that are let in."""
         self.offered = self.dropped = 0
+        self.latency = RecentLatencies()  # from the instant of a state to its being taken
         self._wants = wants
         self._messages: deque[Message] = deque(maxlen=size)
         self._filled = Condition()
+        self._now: Callable[[], int] | None = None
+        self._on_opened: Callable[[], None] | None = None
+
+    def attend(self, now: Callable[[], int], on_opened: Callable[[], None]) -> None:
+        """Before a session: `on_opened` is called in the output's thread when that first takes messages, and so is open;
+        from then on latencies are measured by `now`."""
+        self._now, self._on_opened = now, on_opened
 
     def put(self, message: Message) -> None:
         """Leave a message, if it is of a wanted kind. Never waits for the reader."""
@@ -39,11 +56,19 @@ class Outbox:
 
     def take(self, timeout_s: float) -> list[Message]:
         """All that was left since the last time, oldest first; waits up to `timeout_s` for the first. Empty after that."""
+        if self._on_opened:
+            on_opened, self._on_opened = self._on_opened, None
+            on_opened()
         with self._filled:
             if not self._messages:
                 self._filled.wait(timeout_s)
             messages = list(self._messages)
             self._messages.clear()
+        if self._now:
+            now = self._now()
+            for message in messages:
+                if type(message) is StateMessage:
+                    self.latency.add(max(0, now - message.t_ns))
         return messages
 
     def rouse(self) -> None:
@@ -67,3 +92,14 @@ class LiveOutput(Protocol):
 
     def notes(self) -> dict[str, str]:
         """What the health should tell of it, such as whether the autopilot uses what it is sent."""
+
+
+@dataclass(frozen=True)
+class Around:
+    """What an output may build on besides the configuration."""
+
+    clock: HostClock  # the time line of all stamps
+    inputs: Mapping[str, LiveInput[Any]]  # by kind and name, such as mavlink.fc: to answer on the link one hears
+
+
+Factory = Callable[[Config, Around], Sequence[LiveOutput]]  # raises ConfigError, also where an extra is missing

@@ -1,7 +1,8 @@
-"""Zenoh out: a session that keeps to itself unless told otherwise, and the publisher of the state.
+"""Zenoh: a session that keeps to itself unless told otherwise, and the publishers of all messages.
 
 A session hears and speaks on loopback only, by default: no multicast scouting, no gossip, no listener on other
-interfaces. Publishing never waits: when a reader cannot keep up, samples are dropped, not the pace of the filter.
+interfaces. Publishing never waits. Streams (state, settled, innovations) lose samples when a reader cannot keep up. What is
+told seldom (health, events, info, config) is kept here: readers that find one missing, or come late, fetch it.
 """
 
 from __future__ import annotations
@@ -15,10 +16,18 @@ from types import TracebackType
 from typing import cast
 
 import zenoh
+import zenoh.ext
 
 from fusiond.config import Encoding
 from fusiond.config import Zenoh as ZenohSection
-from fusiond.messages import StateMessage, encode
+from fusiond.messages import MESSAGES, InnovationMessage, Message, encode
+from fusiond.publication import key as key_of
+
+STREAMS = ("state", "settled", "innovations")
+PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
+KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
+TELL_LAST_S = 1.0  # a reader hears within this that it missed the last one
+KIND = {message: kind for kind, message in MESSAGES.items()}
 
 CONTENT_TYPES: dict[Encoding, str] = {"json": "application/json", "msgpack": "application/msgpack"}
 
@@ -29,11 +38,16 @@ class PublishError(Exception):
 
 def state_key(vehicle: str) -> str:
     """Where the state of a vehicle is published."""
-    return f"fusiond/{vehicle}/state"
+    return key_of(vehicle, "state")
+
+
+def message_key(message: Message, vehicle: str) -> str:
+    """Where a message is published."""
+    return key_of(vehicle, KIND[type(message)], message.source if isinstance(message, InnovationMessage) else "")
 
 
 def alive_key(vehicle: str) -> str:
-    """The liveliness token of a vehicle's state; `@` hides it from subscribers to `**`."""
+    """The liveliness token of a vehicle; `@` hides it from subscribers to `**`."""
     return f"fusiond/{vehicle}/@alive/state"
 
 
@@ -80,45 +94,68 @@ def _explained(what: str) -> Iterator[None]:
         raise PublishError(f"{what}: {reason}") from error
 
 
-class ZenohStatePublisher:
-    """Publishes state messages, and a liveliness token that tells readers as long as it does.
+class ZenohPublisher:
+    """Publishes messages of all kinds, and a liveliness token that tells readers as long as it does.
 
     A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared.
     """
 
     def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding) -> None:
-        self.key = state_key(vehicle)
-        self._encoding = encoding
-        with _explained(f"zenoh: cannot publish on {self.key}"), ExitStack() as declared:
-            self._publisher = declared.enter_context(
-                session.declare_publisher(
-                    self.key,
-                    encoding=zenoh.Encoding(CONTENT_TYPES[encoding]),
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    priority=zenoh.Priority.REAL_TIME,
-                    express=True,
-                )
-            )
+        self.vehicle = vehicle
+        self._session, self._encoding = session, encoding
+        self._publishers: dict[str, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}  # by key
+        self._closed = False
+        with _explained(f"zenoh: cannot publish on {key_of(vehicle, '**')}"), ExitStack() as declared:
+            for kind in MESSAGES:
+                if kind != "innovations":  # each source's is declared when it comes
+                    self._declare(key_of(vehicle, kind), kind, declared)
             declared.enter_context(session.liveliness().declare_token(alive_key(vehicle)))
             self._declared = declared.pop_all()
 
+    def _declare(self, where: str, kind: str, declared: ExitStack) -> None:
+        encoding, drop = zenoh.Encoding(CONTENT_TYPES[self._encoding]), zenoh.CongestionControl.DROP
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
+        if kind in STREAMS:
+            publisher = self._session.declare_publisher(
+                where, encoding=encoding, congestion_control=drop, priority=PRIORITY[kind], express=kind != "innovations"
+            )
+        else:
+            publisher = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                where,
+                encoding=encoding,
+                congestion_control=drop,
+                cache=zenoh.ext.CacheConfig(KEPT[kind]),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=TELL_LAST_S),
+                publisher_detection=True,
+            )
+        declared.enter_context(publisher)
+        self._publishers[where] = publisher
+
     @property
     def matched(self) -> bool:
-        """Whether anyone subscribes."""
-        status = cast(zenoh.MatchingStatus, self._publisher.matching_status)  # its stub says bool, which it is not
+        """Whether anyone subscribes to the state."""
+        publisher = cast(zenoh.Publisher, self._publishers[state_key(self.vehicle)])
+        status = cast(zenoh.MatchingStatus, publisher.matching_status)  # its stub says bool, which it is not
         return bool(status.matching)
 
-    def publish(self, message: StateMessage) -> None:
+    def publish(self, message: Message) -> None:
         """Send a message to whoever subscribes. Never waits. Raises PublishError where the session is closed."""
+        where = message_key(message, self.vehicle)
         payload = encode(message, self._encoding)
-        with _explained(f"zenoh: cannot publish on {self.key}"):
-            self._publisher.put(payload)
+        if self._closed:
+            raise PublishError(f"zenoh: cannot publish on {where}: closed")
+        with _explained(f"zenoh: cannot publish on {where}"):
+            if where not in self._publishers:
+                self._declare(where, KIND[type(message)], self._declared)
+            self._publishers[where].put(payload)
 
     def close(self) -> None:
-        """Withdraw the token, then the publisher. Closing twice does nothing."""
+        """Withdraw the token, then the publishers. Closing twice does nothing."""
+        self._closed = True
         self._declared.close()
 
-    def __enter__(self) -> ZenohStatePublisher:
+    def __enter__(self) -> ZenohPublisher:
         return self
 
     def __exit__(

@@ -18,6 +18,9 @@ Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 Vector = tuple[float, float, float]
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 Encoding = Literal["json", "msgpack"]
+Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
+PressureMessage = Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"]
+Checksum = Literal["toyota", "honda", "hyundai", "tesla"]
 ImuMessage = Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"]
 
 
@@ -25,6 +28,7 @@ class Vehicle(Section, frozen=True, kw_only=True):
     """[vehicle]"""
 
     name: Name = "vehicle"  # names the vehicle in every published key
+    geoid_m: float = 0.0  # geoid above the ellipsoid here, taken off heights for MAVLink, which counts from the sea
 
 
 class Filter(Section, frozen=True, kw_only=True):
@@ -78,6 +82,10 @@ class Mavlink(Section, frozen=True, kw_only=True):
     own_system: Annotated[int, Meta(ge=0, le=255)] = 0  # fusiond's own system id, live; 0: that of the autopilot
     own_component: Annotated[int, Meta(ge=1, le=255)] = 191  # fusiond's own component id (191: onboard computer)
     request: bool = True  # live: ask the autopilot for the messages needed, at the rates of [imu] and [gnss]
+    timesync: bool = True  # live: measure the autopilot's clock by TIMESYNC round trips
+    signing_key_file: str | None = None  # 32 bytes, or 64 hex digits: sign what is sent, take only what is signed so
+    signing_timestamp_file: str | None = None  # where the last signing timestamp is kept over restarts
+    accept_unsigned: bool = False  # with a key: take unsigned frames as well; wrongly signed ones never
 
 
 class Can(Section, frozen=True, kw_only=True):
@@ -91,6 +99,7 @@ class Can(Section, frozen=True, kw_only=True):
     fd: bool = False  # CAN FD
     bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], where the interface does not set it
     delay_ms: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0  # how old a frame is when it is received
+    j1939: bool = False  # match 29-bit ids by PGN, of any priority and sender; always so where the DBC says J1939
 
 
 class Imu(Section, frozen=True, kw_only=True):
@@ -131,12 +140,26 @@ class Gnss(Section, frozen=True, kw_only=True):
     interval_s: Positive = 0.2  # expected spacing of fixes
 
 
-class Wheel(Section, frozen=True, kw_only=True):
-    """[wheel.NAME]: one wheel; each is a source of its own."""
+class Barometer(Section, frozen=True, kw_only=True):
+    """[barometer.NAME]: a static pressure sensor."""
 
-    bus: Name  # the [can.BUS] it comes by
-    message: str  # message name in the DBC
-    signal: str  # signal name in the DBC
+    link: Name  # the [mavlink.LINK] it comes by
+    message: PressureMessage = "SCALED_PRESSURE"  # the message that carries it
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # readings a second to ask the autopilot for, live
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true
+
+
+class Wheel(Section, frozen=True, kw_only=True):
+    """[wheel.NAME]: one wheel; each is a source of its own. By CAN (bus, message, signal) or by MAVLink's WHEEL_DISTANCE
+    (link, index)."""
+
+    bus: Name | None = None  # the [can.BUS] it comes by
+    message: str | None = None  # message name in the DBC
+    signal: str | None = None  # signal name in the DBC
+    link: Name | None = None  # the [mavlink.LINK] whose WHEEL_DISTANCE it comes by, in place of bus, message and signal
+    index: Annotated[int, Meta(ge=0, le=15)] | None = None  # its place in WHEEL_DISTANCE, from 0
+    quantum_m: NotNegative = 0.0  # step of WHEEL_DISTANCE: adds quantum^2/6 over the interval's square to the variance
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # WHEEL_DISTANCE messages a second to ask for, live
     unit: Unit = "km/h"  # of the decoded signal; rad/s and rpm need radius_m
     radius_m: Positive | None = None  # rolling radius
     scale: float = 1.0  # known factor on the signal; negative where it counts backwards
@@ -146,6 +169,9 @@ class Wheel(Section, frozen=True, kw_only=True):
     valid_signal: str | None = None  # a signal that must equal valid_value
     valid_value: int = 0  # what valid_signal must read
     counter_signal: str | None = None  # a rolling counter; a repeated value marks a stale frame
+    checksum: Checksum | None = None  # whose checksum the frame ends with
+    not_available_from: int | None = None  # raw values of the signal from here on mean error or not available
+    base_signal: str | None = None  # a signal in the same unit that is added: J1939's axle speed under a relative one
     position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
     steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
     sigma_mps: Positive = 0.1  # white noise of one reading
@@ -159,6 +185,8 @@ class Publish(Section, frozen=True, kw_only=True):
     """[publish]"""
 
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
+    settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # of the state at the horizon, at most; 0: none
+    innovations: bool = True  # tell of every measurement how it was judged
     encoding: Encoding = "json"  # "json" or "msgpack"
 
 
@@ -187,6 +215,80 @@ class Record(Section, frozen=True, kw_only=True):
     total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
 
 
+class Mcap(Section, frozen=True, kw_only=True):
+    """[mcap]: MCAP files of everything published, for Foxglove; needs the extra `mcap`."""
+
+    folder: str | None = None  # such as "/var/lib/fusiond/mcap"; none: nothing is written
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # states a second, at most; none: every one
+    file_mb: Annotated[float, Meta(ge=0.5, le=100_000)] = 64.0  # a file that has grown to about this is followed by another
+    total_mb: Annotated[float, Meta(ge=1, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
+
+
+class Foxglove(Section, frozen=True, kw_only=True):
+    """[foxglove]: a WebSocket server that Foxglove connects to; needs the extra `foxglove`."""
+
+    enabled: bool = False  # serve
+    host: str = "127.0.0.1"  # address to listen on; there is no access control
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8765  # TCP port; 0: any that is free
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = 20.0  # states a second, at most
+
+
+class Ros2(Section, frozen=True, kw_only=True):
+    """[ros2]: what ROS 2 nodes with rmw_zenoh can subscribe to, without ROS here; needs the extra `ros2`."""
+
+    enabled: bool = False  # publish
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID
+    namespace: Annotated[str, Meta(pattern=r"^(/|(/[A-Za-z_][A-Za-z0-9_]*)+)$")] = "/"  # of the node and its topics
+    node: Name = "fusiond"  # name of the node
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # states a second, at most
+    map_frame: Frame = "map"  # east-north-up at the origin; the pose in it jumps when the filter corrects itself
+    odom_frame: Frame = "odom"  # the pose in it drifts, but never jumps
+    base_frame: Frame = "base_link"  # the IMU's place, with axes forward-left-up
+    origin: Vector | None = None  # of the map frame: latitude, longitude [deg], height; none: the first position
+    tf: bool = True  # tell tf2 of map, odom and base_link; false where another node does
+    type_hashes: bool = True  # as in ROS 2 Iron and later; false for Humble, which has none
+    mode: Literal["client", "peer"] = "client"  # a client needs a router (rmw_zenohd), a peer does not
+    connect: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # Zenoh endpoints to connect to
+    listen: list[str] = field(default_factory=list)  # Zenoh endpoints to listen on, as a peer
+    config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
+
+
+class Prometheus(Section, frozen=True, kw_only=True):
+    """[prometheus]: metrics for Prometheus, over HTTP at /metrics; needs the extra `prometheus`."""
+
+    enabled: bool = False  # serve
+    host: str = "127.0.0.1"  # address to listen on; there is no access control
+    port: Annotated[int, Meta(ge=0, le=65535)] = 9464  # TCP port; 0: any that is free
+
+
+class Autopilot(Section, frozen=True, kw_only=True):
+    """[autopilot]: the state sent back to the autopilot as a source of its own estimator, live; off without a link."""
+
+    link: Name | None = None  # the [mavlink.LINK] of the autopilot; none: nothing is sent
+    kind: Literal["ardupilot", "px4"] = "ardupilot"  # whose rules the messages follow
+    message: Literal["odometry", "gps_input", "vision_position"] = "odometry"  # PX4 takes no gps_input
+    rate_hz: Annotated[float, Meta(ge=4, le=200)] = 30.0  # messages a second; at most publish.rate_hz
+    dead_reckoning: bool = True  # send while dead reckoning too, within the limits below
+    position_sigma_m: Positive = 5.0  # nothing is sent beyond this horizontal position sigma, north or east
+    velocity_sigma_mps: Positive = 1.0  # nor beyond this velocity sigma
+    yaw_sigma_deg: Positive = 15.0  # nor beyond this yaw sigma
+    age_ms: Positive = 500.0  # nor when the last IMU sample is older
+    set_origin: bool = False  # tell the autopilot where the local origin is, as long as it has none of its own
+    gps_id: Annotated[int, Meta(ge=0, le=1)] = 1  # which receiver gps_input stands for: 0 is the first, 1 the second
+
+
+class GroundStation(Section, frozen=True, kw_only=True):
+    """[ground_station]: telemetry, events and answers for a ground station, live; off without link and connection."""
+
+    link: Name | None = None  # send over this [mavlink.LINK], to be routed by the autopilot
+    connection: str | None = None  # or over a connection of its own, such as "udpout:192.168.1.10:14550"
+    baud: Annotated[int, Meta(gt=0)] = 115200  # of that connection, for serial devices
+    system: Annotated[int, Meta(ge=0, le=255)] = 0  # own system id on that connection; 0: that of the autopilot
+    component: Annotated[int, Meta(ge=1, le=255)] = 191  # own component id on that connection (191: onboard computer)
+    rate_hz: Annotated[float, Meta(ge=0.1, le=100)] = 4.0  # position and attitude messages a second
+    marker_system: Annotated[int, Meta(ge=0, le=255)] = 0  # system id of a vehicle that marks the state on the map; 0: none
+
+
 class Config(Section, frozen=True, kw_only=True):
     """The whole file."""
 
@@ -197,11 +299,18 @@ class Config(Section, frozen=True, kw_only=True):
     zenoh: Zenoh = field(default_factory=Zenoh)
     live: Live = field(default_factory=Live)
     record: Record = field(default_factory=Record)
+    autopilot: Autopilot = field(default_factory=Autopilot)
+    ground_station: GroundStation = field(default_factory=GroundStation)
+    mcap: Mcap = field(default_factory=Mcap)
+    foxglove: Foxglove = field(default_factory=Foxglove)
+    prometheus: Prometheus = field(default_factory=Prometheus)
+    ros2: Ros2 = field(default_factory=Ros2)
     mavlink: dict[Name, Mavlink] = field(default_factory=dict)
     can: dict[Name, Can] = field(default_factory=dict)
     imu: dict[Name, Imu] = field(default_factory=dict)
     gnss: dict[Name, Gnss] = field(default_factory=dict)
     wheel: dict[Name, Wheel] = field(default_factory=dict)
+    barometer: dict[Name, Barometer] = field(default_factory=dict)
     directory: str = "."  # set on loading: where relative file names start
 
     def path(self, name: str) -> Path:
@@ -241,14 +350,24 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
         refer("imu", name, "link", imu.link, config.mavlink)
     for name, gnss in config.gnss.items():
         refer("gnss", name, "link", gnss.link, config.mavlink)
+    found += _contradictions_on_wheels(config)
     for name, wheel in config.wheel.items():
-        refer("wheel", name, "bus", wheel.bus, config.can)
+        if wheel.bus is not None:
+            refer("wheel", name, "bus", wheel.bus, config.can)
+        if wheel.link is not None:
+            refer("wheel", name, "link", wheel.link, config.mavlink)
+    for name, barometer in config.barometer.items():
+        refer("barometer", name, "link", barometer.link, config.mavlink)
     found += _contradictions_on_can(config)
+    found += _contradictions_on_ros2(config)
+    found += _contradictions_on_mavlink_out(config)
+    found += _contradictions_on_signing(config)
     if len(config.imu) != 1:
         key = ".".join(["imu", *list(config.imu)[1:2]])
         found.append((key, f"exactly one [imu.NAME] is needed, found {len(config.imu)}"))
     taken: dict[str, str] = {}
-    for table, named in (("imu", config.imu), ("gnss", config.gnss), ("wheel", config.wheel)):
+    tables = (("imu", config.imu), ("gnss", config.gnss), ("wheel", config.wheel), ("barometer", config.barometer))
+    for table, named in tables:
         for name in named:
             if name in taken:
                 found.append((f"{table}.{name}", f"[{taken[name]}.{name}] has this name; each source needs its own"))
@@ -258,6 +377,45 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
     if config.filter.imu_gap_s >= config.filter.horizon_s:
         found.append(("filter.imu_gap_s", f"must be below horizon_s ({config.filter.horizon_s} s)"))
     return found
+
+
+CAN_KEYS = ("message", "signal")
+GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
+
+
+def _contradictions_on_wheels(config: Config) -> Iterator[tuple[str, str]]:
+    """A wheel comes either by CAN or by MAVLink."""
+    for name, wheel in config.wheel.items():
+        if (wheel.bus is None) == (wheel.link is None):
+            yield f"wheel.{name}", "one of 'bus' (CAN) and 'link' (MAVLink's WHEEL_DISTANCE) is needed, and not both"
+        wanted, others = (CAN_KEYS, ("index",)) if wheel.link is None else (("index",), CAN_KEYS + GUARD_KEYS)
+        for key in wanted:
+            if getattr(wheel, key) is None:
+                yield f"wheel.{name}", f"the key '{key}' is missing"
+        for key in others:
+            if getattr(wheel, key) is not None:
+                yield f"wheel.{name}.{key}", f"has no meaning for a wheel that comes by {'link' if wheel.link else 'bus'}"
+        if wheel.link is None and wheel.quantum_m:
+            yield f"wheel.{name}.quantum_m", "is for wheels that come by link; use quantum_mps"
+
+
+def _contradictions_on_signing(config: Config) -> Iterator[tuple[str, str]]:
+    for name, mavlink in config.mavlink.items():
+        if (mavlink.signing_key_file is None) != (mavlink.signing_timestamp_file is None):
+            yield f"mavlink.{name}", "signing needs both signing_key_file and signing_timestamp_file"
+
+
+def _contradictions_on_ros2(config: Config) -> Iterator[tuple[str, str]]:
+    ros2 = config.ros2
+    if not ros2.enabled:
+        return
+    if len({ros2.map_frame, ros2.odom_frame, ros2.base_frame}) < 3:
+        yield "ros2", "map_frame, odom_frame and base_frame must differ"
+    if ros2.origin is not None and not (abs(ros2.origin[0]) <= 90 and abs(ros2.origin[1]) <= 180):
+        yield "ros2.origin", "latitude must be in -90 .. 90 and longitude in -180 .. 180 [deg]"
+    own = sorted({*config.zenoh.listen} & {*ros2.connect})
+    if own and config.zenoh.mode != "router":
+        yield "ros2.connect", f"{own[0]} is where [zenoh] listens, and no router: give one of them another port"
 
 
 def _contradictions_on_can(config: Config) -> Iterator[tuple[str, str]]:
@@ -272,3 +430,23 @@ def _contradictions_on_can(config: Config) -> Iterator[tuple[str, str]]:
                 yield f"can.{name}.dbc", f"no such file: {config.path(dbc)}"
         if not can.dbc and any(wheel.bus == name for wheel in config.wheel.values()):
             yield f"can.{name}", 'its wheels need a DBC file: dbc = ["FILE.dbc"]'
+
+
+def _contradictions_on_mavlink_out(config: Config) -> Iterator[tuple[str, str]]:
+    autopilot, station = config.autopilot, config.ground_station
+    have = ", ".join(sorted(config.mavlink)) or "none"
+    for table, link in (("autopilot", autopilot.link), ("ground_station", station.link)):
+        if link is not None and link not in config.mavlink:
+            yield f"{table}.link", f"there is no [mavlink.{link}]; configured: {have}"
+    if autopilot.link is not None and autopilot.rate_hz > config.publish.rate_hz:
+        yield "autopilot.rate_hz", f"must be at most publish.rate_hz ({config.publish.rate_hz:g} Hz)"
+    if autopilot.kind == "px4" and autopilot.message == "gps_input":
+        yield "autopilot.message", "PX4 takes no GPS_INPUT; use odometry or vision_position"
+    echo = ("GPS_RAW_INT", "GPS2_RAW")[autopilot.gps_id]
+    heard = any(gnss.link == autopilot.link and gnss.message == echo for gnss in config.gnss.values())
+    if heard and autopilot.message == "gps_input":
+        yield "autopilot.gps_id", f"the autopilot would send it back as {echo}, which a [gnss.NAME] takes for a receiver's"
+    if autopilot.set_origin and autopilot.message == "gps_input":
+        yield "autopilot.set_origin", "gps_input tells where it is; it has no local origin"
+    if station.link is not None and station.connection is not None:
+        yield "ground_station.connection", "give link or connection, not both"

@@ -12,12 +12,15 @@ from fractions import Fraction
 
 from fusiond.config import Config
 from fusiond.fusion import Fusion, Receipt
+from fusiond.kernel import Outcome
 from fusiond.measurements import Received
 from fusiond.messages import OutcomeCounts, StateMessage, state_message
 
 SECOND = 1_000_000_000  # ns
 LONGEST_SILENCE_NS = 60 * SECOND  # ticks go on for so long after an event; a longer hole is passed over
 RATE_DENOMINATOR = 1_000_000  # a rate is taken as a fraction with at most this, so that ticks never drift
+
+FIELDS = {outcome: outcome.name.lower() for outcome in Outcome}  # of OutcomeCounts
 
 OnTick = Callable[[int, StateMessage], None]  # time since the first event [ns], message
 
@@ -43,6 +46,8 @@ class Engine:
         self._on_tick, self._before_tick = on_tick, before_tick
         self._period = SECOND / Fraction(rate_hz).limit_denominator(RATE_DENOMINATOR)
         self._tick = 0  # number of the next tick
+        self.take: Callable[[Received], Receipt | None] = self.fusion.receive
+        """Fuse an event, after `advance` to its receipt. None where it taught the clock only."""
 
     @property
     def elapsed_ns(self) -> int:
@@ -59,12 +64,9 @@ class Engine:
         if self.first_ns is None:
             self.first_ns = self.now_ns = t_receive_ns
         if t_receive_ns > self.now_ns:
-            self._publish_before(t_receive_ns)
+            if self._on_tick is not None:
+                self._publish_before(t_receive_ns)
             self.now_ns = t_receive_ns
-
-    def take(self, event: Received) -> Receipt | None:
-        """Fuse an event, after `advance` to its receipt. None where it taught the clock only."""
-        return self.fusion.receive(event)
 
     def elapse(self, t_ns: int) -> None:
         """Make the ticks up to an instant before which no event can come any more."""
@@ -77,8 +79,7 @@ class Engine:
 
     def message(self, t_ns: int) -> StateMessage:
         """What is to be told of an instant."""
-        outcomes = OutcomeCounts(**{name.lower(): count for name, count in self.fusion.totals().items()})
-        return state_message(self.fusion.estimate_at(t_ns), self._vehicle, outcomes)
+        return state_message(self.fusion.estimate_at(t_ns), self._vehicle, totals(self.fusion))
 
     def _since(self, number: int) -> int:
         """The instant of a tick, from the first event."""
@@ -100,3 +101,9 @@ class Engine:
             following = -((self.first_ns - t_ns) * self._period.denominator // self._period.numerator)
             self.skipped += following - self._tick
             self._tick = following
+
+
+def totals(fusion: Fusion) -> OutcomeCounts:
+    """Counts of outcomes over all sources."""
+    counts = fusion.history.counts.sum(axis=0).tolist()
+    return OutcomeCounts(**{name: counts[outcome] for outcome, name in FIELDS.items()})

@@ -15,13 +15,14 @@ from typing import Any, Protocol
 from fusiond.config import Config
 from fusiond.engine import Engine
 from fusiond.kernel import Outcome
-from fusiond.messages import StateMessage
-from fusiond.report import Latencies
+from fusiond.latency import RecentLatencies
+from fusiond.messages import Message, StateMessage
+from fusiond.publication import Publication, Surroundings
 
 MICROSECOND = 1_000  # ns
 MOVED_NS = 100 * MICROSECOND  # less is only to tell apart frames that were read at once
 
-OnTick = Callable[[StateMessage], None]
+OnMessage = Callable[[Message], None]
 
 
 class Source(Protocol):
@@ -36,22 +37,25 @@ class Source(Protocol):
 
 
 class LiveEngine:
-    """Engine and inputs of a running daemon. `record` takes kind of file, stamp, bytes; `now` reads the time line."""
+    """Engine and inputs of a running daemon. `now` reads the time line; `on_message` takes whatever is to go out;
+    `surroundings` tells the health of the shell; `record` takes kind of file, stamp, bytes."""
 
     def __init__(
         self,
         config: Config,
         now: Callable[[], int],
-        on_tick: OnTick,
+        on_message: OnMessage,
+        surroundings: Callable[[], Surroundings] = Surroundings,
         record: Callable[[str, int, bytes], None] | None = None,
     ) -> None:
         self.engine = Engine(config, config.publish.rate_hz, self._tick)
+        self.publication = Publication(config, self.engine, surroundings)
         self.record = record
         self.moved = self.most_moved_ns = 0  # stamps, see above
         self.offered = 0  # measurements given to the fusion
-        self.to_fusion = Latencies()  # from receipt to having been fused
-        self.to_publication = Latencies()  # from the newest receipt in a publication, or its tick, to its being sent
-        self._now, self._on_tick = now, on_tick
+        self.to_fusion = RecentLatencies()  # from receipt to having been fused
+        self.to_publication = RecentLatencies()  # from the instant of a tick to its being handed to the outputs
+        self._now, self._on_message = now, on_message
         self._last_ns = 0
 
     @property
@@ -87,11 +91,15 @@ class LiveEngine:
             receipt = self.engine.take(event)
             if receipt is not None:
                 self.offered += 1
+                self.publication.add(event, receipt)
                 if receipt.outcome is not Outcome.INVALID:
                     self.to_fusion.add(max(0, self._now() - t_ns))
         if self.record:
             self.record(source.file, t_ns, source.record(item, t_ns))
 
-    def _tick(self, _since_start_ns: int, message: StateMessage) -> None:
-        self._on_tick(message)
-        self.to_publication.add(max(0, self._now() - max(message.t_ns, self.engine.now_ns)))
+    def _tick(self, since_start_ns: int, message: StateMessage) -> None:
+        messages = self.publication.at(since_start_ns, message)
+        self._on_message(next(messages))  # the state itself, before the work on the others begins
+        self.to_publication.add(max(0, self._now() - message.t_ns))
+        for other in messages:
+            self._on_message(other)

@@ -1,14 +1,15 @@
 """The published messages: their types, their encodings, their JSON Schema, and the CSV row of a publication.
 
 A message is built once from an estimate, degrees and all; both encodings and the CSV row are made from its numbers, so
-they agree bit for bit. No message ever carries a number that is not finite.
+they agree bit for bit. No message ever carries a number that is not finite. Messages are immutable, so whoever holds one
+holds state and covariance of one instant: nothing can change under a reader, in whatever thread.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -77,8 +78,8 @@ class State(Message, frozen=True, kw_only=True):
     sigma_mount_deg: Annotated[tuple[float, float], _about("sigmas of mount_deg [deg]")]
 
 
-class StateMessage(Message, frozen=True, kw_only=True):
-    """The filter's answer at one instant, published on fusiond/<vehicle>/state."""
+class StateAtInstant(Message, frozen=True, kw_only=True):
+    """What StateMessage and SettledMessage have in common: their layout."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
@@ -93,7 +94,176 @@ class StateMessage(Message, frozen=True, kw_only=True):
     outcomes: Annotated[OutcomeCounts, _about("what became of the measurements so far")]
 
 
-MESSAGES: dict[str, type[Message]] = {"state": StateMessage}  # by the last part of the key
+class StateMessage(StateAtInstant, frozen=True, kw_only=True):
+    """The filter's answer at one instant, published on fusiond/<vehicle>/state."""
+
+
+class SettledMessage(StateAtInstant, frozen=True, kw_only=True):
+    """The state at the horizon, which no late measurement can change any more, on fusiond/<vehicle>/settled."""
+
+
+OutcomeName = Literal["fused", "rejected", "too_old", "duplicate", "invalid", "waiting"]
+SourceStatus = Literal["nominal", "noisy", "biased", "frozen", "absent"]
+EventKind = Literal["mode", "reset", "source_lost", "source_found", "source_status"]
+Severity = Literal["info", "notice", "warning", "critical"]
+
+
+class InnovationMessage(Message, frozen=True, kw_only=True):
+    """How one measurement was judged, as soon as it was, on fusiond/<vehicle>/innovations/<source>."""
+
+    schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
+    vehicle: Annotated[str, _about("name of the vehicle")]
+    source: Annotated[str, _about("whose measurement")]
+    t_ns: Annotated[int, _about("instant it was true at [ns]")]
+    t_receive_ns: Annotated[int, _about("when it was received [ns]")]
+    outcome: Annotated[OutcomeName, _about("what became of it; a late measurement of another source can change that yet")]
+    test_ratio: Annotated[float | None, _about("squared innovation over its limit, 1 at the gate; null if not judged")]
+    innovation: Annotated[
+        tuple[float, ...], _about("measurement less prediction, in the measurement's unit; empty if not judged")
+    ]
+    variance: Annotated[tuple[float, ...], _about("variances that the filter expected of the innovation, per axis")]
+    reason: Annotated[str | None, _about("why it is invalid; null otherwise")] = None
+
+
+class EventMessage(Message, frozen=True, kw_only=True):
+    """Something happened that a person may want to know at once, on fusiond/<vehicle>/events."""
+
+    schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
+    vehicle: Annotated[str, _about("name of the vehicle")]
+    t_ns: Annotated[int, _about("when it was seen [ns]")]
+    kind: Annotated[EventKind, _about("mode, reset, source_lost, source_found or source_status")]
+    severity: Annotated[Severity, _about("info, notice, warning or critical")]
+    subject: Annotated[str, _about("the mode entered, or the source; empty for a reset")]
+    text: Annotated[str, _about("what to tell people, in a line")]
+
+
+class Quantiles(Message, frozen=True, kw_only=True):
+    """Of the latest few thousand latencies."""
+
+    p50: Annotated[float, _about("median [ms]")]
+    p90: Annotated[float, _about("90 % are below [ms]")]
+    p99: Annotated[float, _about("99 % are below [ms]")]
+    max: Annotated[float, _about("largest [ms]")]
+
+
+class LatencyHealth(Message, frozen=True, kw_only=True):
+    """How long things take inside; null before the first."""
+
+    fused: Annotated[Quantiles | None, _about("from the receipt of a measurement to its having been fused [ms]")] = None
+    published: Annotated[
+        Quantiles | None, _about("from the instant of a publication to its being handed to the outputs [ms]")
+    ] = None
+
+
+class ClockHealth(Message, frozen=True, kw_only=True):
+    """How the clock that a source stamps with is placed on the time line."""
+
+    name: Annotated[str, _about("the clock: unix, <link>/<system>/boot, or arrival where there is no stamp")]
+    method: Annotated[str, _about("unix, timesync, system_time, least_offset or arrival")]
+    offset_ms: Annotated[float, _about("time line less the clock's stamp [ms]")]
+    drift_ppm: Annotated[float, _about("how much faster the host's clock runs")]
+    jitter_ms: Annotated[float, _about("mean of receipt less aligned stamp since the last re-alignment [ms]")]
+    resets: Annotated[int, _about("re-alignments after a jump or a reboot")]
+    strays: Annotated[int, _about("stamps that made no sense")]
+    note: Annotated[str, _about("why no better method is in use")] = ""
+
+
+class Probabilities(Message, frozen=True, kw_only=True):
+    """What a source is up to; they sum to 1."""
+
+    nominal: Annotated[float, _about("as its configuration says")]
+    noisy: Annotated[float, _about("scatters more than that")]
+    biased: Annotated[float, _about("off to one side")]
+    frozen: Annotated[float, _about("repeats itself")]
+    absent: Annotated[float, _about("not there")]
+
+
+class SourceHealth(Message, frozen=True, kw_only=True):
+    """One source of measurements."""
+
+    outcomes: Annotated[OutcomeCounts, _about("what became of its measurements so far")]
+    present: Annotated[bool, _about("whether anything of it was received in the last 2 s")]
+    age_ms: Annotated[float | None, _about("since its last receipt [ms]; null before the first")] = None
+    rate_hz: Annotated[float, _about("receipts a second, lately")] = 0.0
+    test_ratio: Annotated[float | None, _about("of its last measurement, 1 at the gate; null if none was judged")] = None
+    nis_mean: Annotated[
+        float | None, _about("mean over the horizon of the squared innovations per axis, in sigmas: 1 is as expected")
+    ] = None
+    clock: Annotated[ClockHealth | None, _about("the clock it stamps with; null before the first measurement")] = None
+    probabilities: Annotated[Probabilities | None, _about("what it is up to; null if that is not judged")] = None
+    status: Annotated[SourceStatus | None, _about("the likeliest of these; null if that is not judged")] = None
+    reason: Annotated[str | None, _about("what speaks for that status; null if nothing needs saying")] = None
+
+
+class InputHealth(Message, frozen=True, kw_only=True):
+    """One link or bus."""
+
+    received: Annotated[int, _about("frames received")]
+    dropped: Annotated[int, _about("frames dropped, the oldest first, because the queue was full")]
+    counts: Annotated[dict[str, int], _about("what became of the others, by kind; and of the link")]
+
+
+class OutputHealth(Message, frozen=True, kw_only=True):
+    """One output."""
+
+    offered: Annotated[int, _about("messages left for it")]
+    dropped: Annotated[int, _about("messages dropped, the oldest first, because it was slow or away")]
+    latency_ms: Annotated[
+        Quantiles | None, _about("from the instant of a publication to its being taken up by this output; null before")
+    ] = None
+    counts: Annotated[dict[str, int], _about("what became of the others, by kind")]
+    notes: Annotated[dict[str, str], _about("what else there is to tell, such as whether the autopilot uses it")]
+
+
+class HealthMessage(Message, frozen=True, kw_only=True):
+    """How everything is, each second and at every change of mode, resets or sources, on fusiond/<vehicle>/health."""
+
+    schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
+    vehicle: Annotated[str, _about("name of the vehicle")]
+    t_ns: Annotated[int, _about("the instant it tells of [ns]")]
+    version: Annotated[str, _about("of fusiond")]
+    uptime_s: Annotated[float, _about("since the first measurement [s]")]
+    mode: Annotated[Mode, _about("as in the state")]
+    resets: Annotated[int, _about("how often the state was reset, that is: jumped")]
+    reset_reason: Annotated[str | None, _about("why it was reset the last time; null before")] = None
+    outcomes: Annotated[OutcomeCounts, _about("over all sources")]
+    latency_ms: Annotated[LatencyHealth, _about("how long things take inside")]
+    sources: Annotated[dict[str, SourceHealth], _about("by name")]
+    inputs: Annotated[dict[str, InputHealth], _about("by kind and name, such as mavlink.fc")]
+    outputs: Annotated[dict[str, OutputHealth], _about("by name, such as zenoh")]
+
+
+class InfoMessage(Message, frozen=True, kw_only=True):
+    """What is running here, on fusiond/<vehicle>/info."""
+
+    schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
+    vehicle: Annotated[str, _about("name of the vehicle")]
+    version: Annotated[str, _about("of fusiond")]
+    kernel: Annotated[Literal["compiled", "numpy"], _about("compiled, or its slower twin in NumPy")]
+    encoding: Annotated[Encoding, _about("of everything published over Zenoh")]
+    schemas: Annotated[dict[str, int], _about("versions of the messages' layouts, by the last part of the key")]
+    keys: Annotated[dict[str, str], _about("what is published where, by the last part of the key")]
+    sources: Annotated[dict[str, str], _about("what each source measures: imu, gnss_position, ...")]
+    config: Annotated[dict[str, Any], _about("the configuration, defaults filled in")]
+
+
+class ConfigMessage(Message, frozen=True, kw_only=True):
+    """The configuration in force, on fusiond/<vehicle>/config."""
+
+    schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
+    vehicle: Annotated[str, _about("name of the vehicle")]
+    config: Annotated[dict[str, Any], _about("the configuration, defaults filled in")]
+
+
+MESSAGES: dict[str, type[Message]] = {  # by the last part of the key; of innovations, each source has a key of its own
+    "state": StateMessage,
+    "settled": SettledMessage,
+    "health": HealthMessage,
+    "innovations": InnovationMessage,
+    "events": EventMessage,
+    "info": InfoMessage,
+    "config": ConfigMessage,
+}
 
 
 def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
@@ -102,8 +272,20 @@ def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> 
     A state with a number that is not finite, or with a negative variance, is withheld: the message then has mode
     `lost`, no state, and says in `fault` which number was to blame. So the publication goes on, and a reader sees why.
     """
+    return _told(StateMessage, estimate, vehicle, outcomes)
+
+
+def settled_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
+    """The same of an estimate at the horizon."""
+    return _told(SettledMessage, estimate, vehicle, outcomes)
+
+
+AnyState = TypeVar("AnyState", bound=StateAtInstant)
+
+
+def _told(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
     state, fault = _checked(estimate.state) if estimate.state is not None else (None, None)
-    return StateMessage(
+    return kind(
         vehicle=vehicle,
         t_ns=estimate.t_ns,
         mode=Mode.LOST if fault else estimate.mode,
@@ -175,8 +357,10 @@ def _degrees(angles: tuple[float, float]) -> tuple[float, float]:
 
 
 def _block(estimate: StateEstimate, block: slice) -> Block:
+    """Symmetric to the last bit, which the turn into n leaves open."""
     a, b, c, d, e, f, g, h, i = estimate.covariance[block, block].ravel().tolist()
-    return a, b, c, d, e, f, g, h, i
+    b, c, f = (b + d) / 2, (c + g) / 2, (f + h) / 2
+    return a, b, c, b, e, f, c, f, i
 
 
 # --- Encodings

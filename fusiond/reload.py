@@ -10,7 +10,7 @@ import msgspec
 from fusiond.config import Config
 from fusiond.toml_file import Section
 
-LIVE_MAVLINK = frozenset({"connection", "baud", "own_system", "own_component", "request"})
+LIVE_MAVLINK = frozenset({"connection", "baud", "own_system", "own_component", "request", "timesync"})
 LIVE_CAN = frozenset({"interface", "channel", "config_context", "fd", "bitrate"})
 LIVE_IMU = frozenset({"rate_hz"})
 LIVE_LIVE = frozenset({"reopen_max_s"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from queue import Queue
@@ -14,8 +14,9 @@ from threading import Condition, Thread
 from pymavlink.dialects.v20 import common
 
 from fusiond import config
-from fusiond.daemon import Daemon
+from fusiond.daemon import Daemon, punctual_loop
 from fusiond.messages import StateMessage
+from fusiond_adapters.outputs import LiveOutput
 
 DEADLINE = 15.0  # s, for anything awaited
 SYSTEM, COMPONENT = 7, 1
@@ -106,9 +107,14 @@ class Running:
     """A daemon in a thread of its own, and what it published."""
 
     def __init__(
-        self, settings: config.Config, load: Callable[[], config.Config] | None = None, *, zenoh: bool = False
+        self,
+        settings: config.Config,
+        load: Callable[[], config.Config] | None = None,
+        *,
+        outputs: Sequence[LiveOutput] = (),
+        zenoh: bool = False,
     ) -> None:
-        self.daemon = Daemon(settings, load, [self._add], zenoh=zenoh)
+        self.daemon = Daemon(settings, load, [self._add], outputs, zenoh=zenoh)
         self.messages: list[StateMessage] = []
         self._changed = Condition()
         self._loops: Queue[asyncio.AbstractEventLoop] = Queue()
@@ -121,7 +127,8 @@ class Running:
             await self.daemon.run()
 
         try:
-            asyncio.run(main())
+            with asyncio.Runner(loop_factory=punctual_loop) as runner:
+                runner.run(main())
         except BaseExceptionGroup as error:
             self._errors.append(error)
 
@@ -162,10 +169,14 @@ class Running:
 
 @contextmanager
 def running(
-    settings: config.Config, load: Callable[[], config.Config] | None = None, *, zenoh: bool = False
+    settings: config.Config,
+    load: Callable[[], config.Config] | None = None,
+    *,
+    outputs: Sequence[LiveOutput] = (),
+    zenoh: bool = False,
 ) -> Iterator[Running]:
     """A daemon that runs inside the block, and has ended in order after it."""
-    run = Running(settings, load, zenoh=zenoh)
+    run = Running(settings, load, outputs=outputs, zenoh=zenoh)
     run.start()
     try:
         yield run

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -18,6 +19,7 @@ from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.messages import (
     CSV_COLUMNS,
     MESSAGES,
+    SCHEMA_VERSION,
     OutcomeCounts,
     State,
     StateMessage,
@@ -219,11 +221,23 @@ def test_schema_files_are_up_to_date() -> None:
 
 
 def test_every_field_is_documented_with_its_meaning() -> None:
+    spec = importlib.util.spec_from_file_location("make_schema", DOCS / "make_schema.py")
+    assert spec is not None and spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
     text = (DOCS / "messages.md").read_text(encoding="utf-8")
-    definitions = msgspec.json.schema_components(MESSAGES.values())[1]
-    for kind in ("StateMessage", "State", "OutcomeCounts"):
-        for name, schema in definitions[kind]["properties"].items():
-            assert f"| `{name}` | {schema['description']} |" in text
+    assert made.page(text) == text, "run: python docs/make_schema.py"
+    for name, kind in MESSAGES.items():
+        assert f"{kind.__name__}" in text and f"fusiond/<vehicle>/{name}" in text
+    for name, schema in msgspec.json.schema_components(MESSAGES.values())[1].items():
+        for field, about in schema.get("properties", {}).items():
+            assert f"| `{field}` | {about['description']} |" in text, f"{name}.{field}"
+
+
+def test_every_message_has_a_version() -> None:
+    for kind in MESSAGES.values():
+        assert kind.__struct_fields__[0] == "schema"
+        assert msgspec.structs.fields(kind)[0].default == SCHEMA_VERSION
 
 
 def test_the_example_in_the_documentation_is_a_message() -> None:

@@ -21,7 +21,7 @@ from fusiond.messages import OutcomeCounts, StateMessage, csv_row, encode, state
 from fusiond_adapters.zenoh import (
     CONTENT_TYPES,
     PublishError,
-    ZenohStatePublisher,
+    ZenohPublisher,
     alive_key,
     open_session,
     session_config,
@@ -107,14 +107,14 @@ def python(code: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def wait_for_reader(publisher: ZenohStatePublisher) -> None:
+def wait_for_reader(publisher: ZenohPublisher) -> None:
     matched = Event()
 
     def watch(status: zenoh.MatchingStatus) -> None:
         if status.matching:
             matched.set()
 
-    with publisher._publisher.declare_matching_listener(watch):
+    with publisher._publishers[state_key("rover")].declare_matching_listener(watch):
         assert publisher.matched or matched.wait(DEADLINE), "nobody subscribed"
 
 
@@ -128,7 +128,7 @@ def test_another_process_gets_every_bit(encoding: Encoding) -> None:
     port = free_port()
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
-        ZenohStatePublisher(session, "rover", encoding) as publisher,
+        ZenohPublisher(session, "rover", encoding) as publisher,
         python(SUBSCRIBER, port, MESSAGES) as reader,
     ):
         assert json.loads(read_line(reader)) == [alive_key("rover")]
@@ -145,13 +145,13 @@ def test_another_process_gets_every_bit(encoding: Encoding) -> None:
 
 def test_the_documented_subscriber_works() -> None:
     text = (DOCS / "messages.md").read_text(encoding="utf-8")
-    code = text.split("```python\n")[1].split("```")[0]
+    code = text.split("```python\n")[2].split("```")[0]
     assert len(code.splitlines()) <= 10
     port = free_port()
     message = messages(2)[1]
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
-        ZenohStatePublisher(session, "rover", "json") as publisher,
+        ZenohPublisher(session, "rover", "json") as publisher,
         python(code.replace(":7447", f":{port}")) as reader,
     ):
         wait_for_reader(publisher)
@@ -238,14 +238,14 @@ def test_a_bad_config_file_is_named(content: bytes | None, tmp_path: Path) -> No
 
 def test_publishing_after_the_end_is_an_error_and_closing_twice_is_not() -> None:
     with open_session(Zenoh()) as session:
-        with ZenohStatePublisher(session, "rover", "json") as publisher:
+        with ZenohPublisher(session, "rover", "json") as publisher:
             publisher.publish(messages(1)[0])
             assert not publisher.matched
         publisher.close()
         with pytest.raises(PublishError, match="fusiond/rover/state"):
             publisher.publish(messages(1)[0])
     with pytest.raises(PublishError, match="session closed"):
-        ZenohStatePublisher(session, "rover", "json")
+        ZenohPublisher(session, "rover", "json")
 
 
 def test_the_token_goes_with_the_publisher() -> None:
@@ -260,7 +260,7 @@ def test_the_token_goes_with_the_publisher() -> None:
         open_session(Zenoh(mode="client", connect=[f"tcp/127.0.0.1:{port}"])) as other,
         other.liveliness().declare_subscriber("fusiond/*/@alive/state", watch, history=True),
     ):
-        publisher = ZenohStatePublisher(session, "rover", "json")
+        publisher = ZenohPublisher(session, "rover", "json")
         assert come.wait(DEADLINE) and not gone.is_set()
         publisher.close()
         assert gone.wait(DEADLINE)

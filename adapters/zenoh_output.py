@@ -1,0 +1,81 @@
+"""Zenoh as a live output: publishes every message in a thread of its own, and answers queries."""
+
+from __future__ import annotations
+
+from threading import Event
+
+import zenoh
+
+from fusiond.config import Config
+from fusiond.messages import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant
+
+from .outputs import POLL_S, Outbox, OutputLost
+from .zenoh import PublishError, ZenohPublisher, open_session
+from .zenoh_answers import Answers
+
+QUEUE_MESSAGES = 1024  # a second of everything, and more
+
+
+class ZenohOutput:
+    """[zenoh] of a configuration. Nothing of it waits for a reader; what it cannot send it counts."""
+
+    def __init__(self, config: Config) -> None:
+        self.name = "zenoh"
+        section = config.zenoh
+        self.about = f"Zenoh ({', '.join([section.mode, *section.listen, *section.connect])})"
+        self.outbox = Outbox(QUEUE_MESSAGES, tuple(MESSAGES.values()))
+        self.sessions = self.sent = self.stale = 0
+        self.answers = Answers(config)
+        self._config = config
+        self._notes: dict[str, str] = {}
+
+    def session(self, stop: Event) -> None:
+        """Open a session, publish until told to stop, close. Raises OutputLost."""
+        config = self._config
+        try:
+            with (
+                open_session(config.zenoh, config.directory) as session,
+                ZenohPublisher(session, config.vehicle.name, config.publish.encoding) as publisher,
+                self.answers.declared(session),
+            ):
+                self.sessions += 1
+                self._serve(session, publisher, stop)
+        except PublishError as error:
+            raise OutputLost(str(error)) from error
+        except zenoh.ZError as error:
+            raise OutputLost(f"zenoh: {error}") from error
+        finally:
+            self._notes = {"session": "closed"}
+
+    def _serve(self, session: zenoh.Session, publisher: ZenohPublisher, stop: Event) -> None:
+        for message in self.outbox.take(0):  # what was left while it was away
+            if isinstance(message, StateAtInstant | InnovationMessage):
+                self.stale += 1
+            else:
+                self._send(publisher, message)
+        self._look(session)
+        stopping = False
+        while not stopping:
+            stopping = stop.is_set()  # and then what is left
+            for message in self.outbox.take(0 if stopping else POLL_S):
+                self._send(publisher, message)
+                if isinstance(message, HealthMessage):  # for the next one: each second or so
+                    self._look(session)
+
+    def _look(self, session: zenoh.Session) -> None:
+        """See to whom the session is connected; here, for the estimator never calls into Zenoh."""
+        routers, peers = len(session.info.routers_zid()), len(session.info.peers_zid())
+        self._notes = {"session": f"{routers} routers, {peers} peers connected"}
+
+    def _send(self, publisher: ZenohPublisher, message: Message) -> None:
+        publisher.publish(message)
+        self.answers.keep(message)
+        self.sent += 1
+
+    def counts(self) -> dict[str, int]:
+        """What became of the messages so far."""
+        return {"sent": self.sent, "stale": self.stale, "sessions": self.sessions, "answered": self.answers.answered}
+
+    def notes(self) -> dict[str, str]:
+        """To whom it is connected."""
+        return self._notes

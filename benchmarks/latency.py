@@ -1,0 +1,265 @@
+"""How long a publication takes to reach a subscriber in another process, and what the daemon's CPU time goes into.
+
+    python -m benchmarks.latency [--seconds 30] [--out out/latency]
+
+Load: IMU at 400 Hz, GNSS at 10 Hz and 200 ms late, both as MAVLink over UDP from a process of their own; four wheels at
+100 Hz in one CAN frame on python-can's virtual bus; 100 publications a second over Zenoh, with the black box running.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import platform
+import resource
+import socket
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+from pymavlink.dialects.v20 import common
+
+from fusiond import __version__, config
+from fusiond.client import Client
+from fusiond.daemon import Daemon, punctual_loop, serve
+from fusiond.messages import StateMessage
+
+IMU_HZ, GNSS_HZ, CAN_HZ, PUBLISH_HZ = 400, 10, 100, 100
+GNSS_LATE_US = 200_000
+SETTLE = 200  # first publications that are left out
+CHANNEL = "latency"
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+SIGNALS = "\n".join(f' SG_ {name} : {16 * i}|16@1+ (0.01,0) [0|0] "km/h" Vector__XXX' for i, name in enumerate(WHEELS))
+DBC = f'VERSION ""\nBU_: ECU\nBO_ 256 WHEELS: 8 ECU\n{SIGNALS}\n'
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def configuration(folder: Path, udp: int, tcp: int) -> config.Config:
+    (folder / "wheels.dbc").write_text(DBC)
+    wheels = "".join(f'[wheel.{name}]\nbus = "car"\nmessage = "WHEELS"\nsignal = "{name}"\n' for name in WHEELS)
+    text = f"""
+[vehicle]
+name = "bench"
+[filter]
+heading_deg = 30.0
+[publish]
+rate_hz = {PUBLISH_HZ}
+[zenoh]
+listen = ["tcp/127.0.0.1:{tcp}"]
+[record]
+folder = "box"
+[mavlink.fc]
+connection = "udpin:127.0.0.1:{udp}"
+[can.car]
+dbc = ["wheels.dbc"]
+interface = "virtual"
+channel = "{CHANNEL}"
+[imu.imu0]
+link = "fc"
+rate_hz = {IMU_HZ}
+[gnss.gps0]
+link = "fc"
+{wheels}"""
+    (folder / "latency.toml").write_text(text)
+    return config.load(folder / "latency.toml")
+
+
+# --- The processes around the daemon
+
+
+def every(hz: int, seconds: float) -> Iterator[int]:
+    """Numbers at a rate, by the monotonic clock."""
+    begin = time.monotonic()
+    for number in range(round(hz * seconds)):
+        wait = begin + number / hz - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        yield number
+
+
+def feed(port: int, seconds: float) -> None:
+    """The autopilot: a vehicle at rest."""
+    link = common.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def say(message: common.MAVLink_message) -> None:
+        peer.sendto(message.pack(link), ("127.0.0.1", port))
+        link.seq = (link.seq + 1) & 0xFF
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for number in every(IMU_HZ, seconds):
+            now_us = time.monotonic_ns() // 1000
+            wobble = 0.01 * (number % 7 - 3)
+            say(common.MAVLink_highres_imu_message(
+                now_us, wobble, 0.0, -9.81, 1e-4, wobble / 10, 0.0, *(0.0,) * 7, 0x3F, 0))  # fmt: skip
+            if number % (IMU_HZ // GNSS_HZ) == 0:
+                say(common.MAVLink_gps_raw_int_message(
+                    now_us - GNSS_LATE_US, 3, 481374300, 115754900, 563000, 80, 120, 0, 0, 14, 563000, 500, 800, 50,
+                ))  # fmt: skip
+            if number % IMU_HZ == 0:
+                kind, maker = common.MAV_TYPE_GROUND_ROVER, common.MAV_AUTOPILOT_GENERIC
+                say(common.MAVLink_heartbeat_message(kind, maker, 0, 0, common.MAV_STATE_ACTIVE, 3))
+
+
+def subscribe(port: int, seconds: float) -> None:
+    """A reader: prints quantiles of how old each state is on its arrival."""
+    by_tick: list[float] = []
+    by_sample: list[float] = []
+
+    def take(message: StateMessage) -> None:
+        age_ms = (time.time_ns() - message.t_ns) / 1e6
+        by_tick.append(age_ms)
+        by_sample.append(age_ms + (message.age_ms or 0.0))
+
+    with Client(f"tcp/127.0.0.1:{port}", "bench") as client, client.subscribed(StateMessage, take):
+        print("ready", flush=True)
+        time.sleep(seconds)
+        dropped = client.health().outputs["zenoh"].dropped
+    print(f"{len(by_tick)} states received, {dropped} messages dropped on the way to Zenoh")
+    for what, found in (("instant of the publication", by_tick), ("stamp of its newest IMU sample", by_sample)):
+        print(f"from the {what} to the subscriber: {quantiles(found[SETTLE:])}")
+
+
+def quantiles(found: list[float]) -> str:
+    cuts = statistics.quantiles(found, n=1000)
+    return f"p50 {cuts[499]:.2f}, p90 {cuts[899]:.2f}, p99 {cuts[989]:.2f}, p99.9 {cuts[998]:.2f}, max {max(found):.2f} ms"
+
+
+def turn_wheels(seconds: float) -> None:
+    with can.Bus(interface="virtual", channel=CHANNEL) as bus:
+        for _ in every(CAN_HZ, seconds):
+            bus.send(can.Message(arbitration_id=256, is_extended_id=False, data=bytes(8)))
+
+
+# --- CPU time
+
+
+class Meter:
+    """CPU time of calls, by stage, in the thread that makes them. A stage inside another is not counted twice."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, int] = {}
+        self._inner = 0
+
+    def watch(self, holder: Any, name: str, stage: str) -> None:
+        """Measure a method from now on."""
+        inside: Callable[..., Any] = getattr(holder, name)
+
+        def measured(*arguments: Any) -> Any:
+            begin, outer, self._inner = time.thread_time_ns(), self._inner, 0
+            try:
+                return inside(*arguments)
+            finally:
+                took = time.thread_time_ns() - begin
+                self.spent[stage] = self.spent.get(stage, 0) + took - self._inner
+                self._inner = outer + took
+
+        setattr(holder, name, measured)
+
+
+def watch_stages(daemon: Daemon, meter: Meter) -> None:
+    """The estimator's thread, stage by stage."""
+    live = daemon.live
+    for source in daemon.inputs.values():
+        meter.watch(source, "decode", f"decode {source.name}")
+        meter.watch(source, "record", "black box")
+    meter.watch(live, "record", "black box")
+    meter.watch(live.engine, "take", "align and fuse")
+    meter.watch(live.engine, "message", "predict and make the state message")
+    meter.watch(live.publication, "health", "health")
+    meter.watch(live, "step", "the rest of a step: order, ticks, settled, innovations, hand-over")
+
+
+def threads_ms() -> dict[str, float]:
+    """CPU time of every thread of this process so far, by name."""
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    tick_ms = 1000 / os.sysconf("SC_CLK_TCK")
+    found: dict[str, float] = {}
+    for task in Path("/proc/self/task").iterdir():
+        name, _, rest = (task / "stat").read_text().partition(") ")
+        fields = rest.split()
+        told = names.get(int(task.name)) or f"Zenoh's own: {name.split('(', 1)[1]}"
+        found[told] = found.get(told, 0.0) + (int(fields[11]) + int(fields[12])) * tick_ms
+    return found
+
+
+@contextmanager
+def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "benchmarks.latency", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
+        try:
+            yield made
+        finally:
+            made.kill()
+
+
+async def measure(folder: Path, seconds: float) -> str:
+    udp, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
+    daemon, meter = Daemon(configuration(folder, udp, tcp)), Meter()
+    run = asyncio.create_task(serve(daemon))
+    await daemon.up.wait()
+    watch_stages(daemon, meter)
+    wheels = threading.Thread(target=turn_wheels, args=(seconds + 1,), name="(the benchmark's wheels)")
+    with process("--subscribe", tcp, "--seconds", seconds + 1) as reader, process("--feed", udp, "--seconds", seconds + 2):
+        assert reader.stdout is not None
+        await asyncio.to_thread(reader.stdout.readline)
+        wheels.start()
+        await asyncio.sleep(1)
+        before, begin = threads_ms(), time.monotonic()
+        meter.spent.clear()
+        await asyncio.sleep(seconds - 1)
+        after, took_ms = threads_ms(), (time.monotonic() - begin) * 1000
+        told = await asyncio.to_thread(reader.stdout.read)
+    health = daemon.health
+    await asyncio.to_thread(wheels.join)
+    daemon.stop()
+    await run
+    assert health is not None
+    lines = [told.strip()]
+    for name, latency in (("receipt to fused", health.latency_ms.fused), ("tick to outputs", health.latency_ms.published)):
+        lines.append(f"inside, {name}: {latency}")
+    lines.append(f"inside, tick to Zenoh's thread: {health.outputs['zenoh'].latency_ms}")
+    spent = {name: ms - before.get(name, 0.0) for name, ms in after.items()}
+    lines += ["", f"CPU, in percent of one core: {100 * sum(spent.values()) / took_ms:.1f}"]
+    lines += [f"  {100 * ms / took_ms:5.1f}  {name}" for name, ms in sorted(spent.items(), key=lambda item: -item[1])]
+    lines += ["of which in MainThread, the estimator:"]
+    stages = sorted(meter.spent.items(), key=lambda item: -item[1])
+    lines += [f"  {100 * ns / 1e6 / took_ms:5.1f}  {stage}" for stage, ns in stages]
+    lines += [f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB; {daemon.losses()}"]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--out", type=Path, default=Path("out/latency"))
+    parser.add_argument("--feed", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--subscribe", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.feed:
+        feed(options.feed, options.seconds)
+    elif options.subscribe:
+        subscribe(options.subscribe, options.seconds)
+    else:
+        options.out.mkdir(parents=True, exist_ok=True)
+        about = f"fusiond {__version__}, Python {platform.python_version()}, {os.cpu_count()} CPUs, {options.seconds:g} s"
+        with asyncio.Runner(loop_factory=punctual_loop) as runner:
+            report = f"{about}\n{runner.run(measure(options.out, options.seconds))}\n"
+        print(report)
+        (options.out / "report.txt").write_text(report)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
