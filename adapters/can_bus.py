@@ -2,39 +2,37 @@
 
 The bus is opened by python-can's own configuration (files, environment, `config_context`); what [can.NAME] gives goes
 first. Where the interface can filter, only frames of the wheels' ids, and error frames, come in. The kernel's stamp of
-a frame is mapped to the host's time line; stamps of other clocks are not used.
+a frame is mapped to the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and
+sets its filters, and `CanSocket` reads it, so that frames lost in the kernel's queue are seen.
 """
 
 from __future__ import annotations
 
+import logging
+import socket
+from collections import Counter
 from threading import Event
-from typing import Any, NamedTuple
+from typing import Any
 
 import can
 
 from fusiond.config import Config
 from fusiond.measurements import Received
 
-from .can import EXTENDED, CanDecoder
+from .can import EXTENDED, PDU2, CanDecoder
+from .can_socket import CanFrame, CanSocket
 from .host_clock import HostClock
 from .inputs import POLL_S, Inbox, InputLost
 
 ID_BITS = 0x1FFFFFFF
 STANDARD_BITS = 0x7FF
-BUS_OFF, RESTARTED = 0x40, 0x100  # classes of error frames, linux/can/error.h
+GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # what of a J1939 id tells its PGN, without and with a destination
+CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100  # classes of error frames, linux/can/error.h
+OVERFLOW, WARNING, PASSIVE, ACTIVE = 0x03, 0x0C, 0x30, 0x40  # what byte 1 says of the controller
 ERROR_FLAG = 0x20000000  # in an id as candump writes it
 BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
 
-
-class CanFrame(NamedTuple):
-    """One frame as received. `fd_flags` is None for classic CAN."""
-
-    arbitration_id: int
-    is_extended: bool
-    data: bytes
-    fd_flags: int | None = None
-    is_remote: bool = False
-    is_error: bool = False
+log = logging.getLogger("fusiond")
 
 
 class CanBus:
@@ -45,7 +43,9 @@ class CanBus:
         self.file = "can.log"
         self.inbox = inbox
         self.decoder = CanDecoder(config, bus)
-        self.sessions = self.error_frames = self.remote_frames = self.bus_off = self.restarted = 0
+        self.state = "active"  # of the controller, by its error frames
+        self.sessions = 0
+        self._seen: Counter[str] = Counter()
         self._channel = config.can[bus].log_channel or bus
         self._clock = clock
         self.configure(config)
@@ -63,7 +63,11 @@ class CanBus:
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise InputLost(f"cannot be opened: {error}") from error
         self.sessions += 1
+        self.state = "active"
         try:
+            opened = getattr(bus, "socket", None)
+            if isinstance(opened, socket.socket) and opened.family == socket.AF_CAN:
+                self._read_socket(CanSocket(opened), stop)
             while not stop.is_set():
                 message = bus.recv(POLL_S)
                 if message is not None:
@@ -72,6 +76,13 @@ class CanBus:
             raise InputLost(f"lost: {error}") from error
         finally:
             bus.shutdown()
+
+    def _read_socket(self, reader: CanSocket, stop: Event) -> None:
+        before = self.inbox.missed
+        while not stop.is_set():
+            for wall_ns, frame in reader.read(POLL_S):
+                self.inbox.put(self._clock.now_ns() if wall_ns is None else self._clock.from_wall_ns(wall_ns), frame)
+            self.inbox.missed = before + reader.dropped
 
     def _open(self) -> can.BusABC:
         settings = self._settings
@@ -86,6 +97,10 @@ class CanBus:
             }
             for key in sorted(self.decoder.keys)
         ]
+        filters += [
+            {"can_id": group << 8, "can_mask": GROUP_BITS if group >> 8 & 0xFF >= PDU2 else FORMAT_BITS, "extended": True}
+            for group in sorted(self.decoder.groups)
+        ]
         bus: can.BusABC = can.Bus(
             interface=settings.interface,
             channel=settings.channel,
@@ -98,14 +113,37 @@ class CanBus:
     def decode(self, item: CanFrame, t_ns: int) -> list[Received]:
         """The wheels in a frame; an error frame has none, and is counted."""
         if item.is_error:
-            self.error_frames += 1
-            self.bus_off += bool(item.arbitration_id & BUS_OFF)
-            self.restarted += bool(item.arbitration_id & RESTARTED)
+            self._take_error(item)
             return []
         if item.is_remote:
-            self.remote_frames += 1
+            self._seen["remote frames"] += 1
             return []
         return self.decoder.decode(item.arbitration_id, item.is_extended, item.data, t_ns)
+
+    def _take_error(self, item: CanFrame) -> None:
+        """Count an error frame; one line in the log when the controller's state changes."""
+        self._seen["error frames"] += 1
+        classes, detail = item.arbitration_id, item.data[1] if len(item.data) > 1 else 0
+        controller = detail if classes & CONTROLLER else 0
+        self._seen["controller overflow"] += bool(controller & OVERFLOW)
+        state = self.state
+        if classes & BUS_OFF:
+            self._seen["bus off"] += 1
+            state = "bus-off"
+        elif classes & RESTARTED:
+            self._seen["restarted"] += 1
+            state = "active"
+        elif controller & PASSIVE:
+            self._seen["error passive"] += 1
+            state = "error-passive"
+        elif controller & WARNING:
+            self._seen["error warning"] += 1
+            state = "error-warning"
+        elif controller & ACTIVE:
+            state = "active"
+        if state != self.state:
+            log.log(logging.INFO if state == "active" else logging.WARNING, "%s: the controller is %s", self.about, state)
+            self.state = state
 
     def record(self, item: CanFrame, t_ns: int) -> bytes:
         """A line of `candump -L`."""
@@ -118,8 +156,8 @@ class CanBus:
 
     def counts(self) -> dict[str, int]:
         """What became of the frames so far, and of the bus."""
-        own = {"sessions": self.sessions, "error frames": self.error_frames, "remote frames": self.remote_frames}
-        return {**own, "bus off": self.bus_off, "restarted": self.restarted, **self.decoder.counts}
+        own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
+        return {**own, **{name: count for name, count in self._seen.items() if count}, **self.decoder.counts}
 
 
 def _frame(message: can.Message) -> CanFrame:

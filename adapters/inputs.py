@@ -27,6 +27,7 @@ class Inbox(Generic[Item]):
 
     def __init__(self, size: int, wake: Callable[[], None]) -> None:
         self.received = self.dropped = 0
+        self.missed = 0  # frames that were lost before they came here, as far as the input can tell
         self._items: deque[tuple[int, Item]] = deque(maxlen=size)
         self._wake = wake
         self._lock = Lock()

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from threading import Event
+import logging
+from collections.abc import Callable, Mapping
+from threading import Event, Lock
+from typing import Any
 
 from fusiond.config import Config
 from fusiond.measurements import Received
 from fusiond.toml_file import ConfigError
 
 from .host_clock import HostClock
-from .inputs import POLL_S, Inbox, InputLost
+from .inputs import POLL_S, Inbox, InputLost, LiveInput
 from .logs.tlog import STAMP
 from .mavlink import FrameSplitter, MavlinkDecoder
 from .mavlink_talk import MavlinkTalk
 from .transport import Transport, opener
 
+log = logging.getLogger("fusiond")
+
 
 class MavlinkLink:
-    """One [mavlink.NAME]. `alive` tells whether the estimator works: only then are heartbeats sent.
+    """One [mavlink.NAME]. `alive` tells whether the estimator works: only then are heartbeats sent. `listeners` are
+    called with every frame that comes in and its stamp, in the link's thread: they must not wait.
 
     Raises ConfigError where the connection string is none, or the dialect lacks a wanted message.
     """
@@ -30,8 +35,11 @@ class MavlinkLink:
         self.file = f"{link}.tlog"
         self.inbox = inbox
         self.decoder = MavlinkDecoder(config, link)
+        self.listeners: list[Callable[[bytes, int], None]] = []
         self.sessions = self.skipped_bytes = self.sent = 0
         self._clock, self._alive = clock, alive
+        self._sending = Lock()  # guards the way out: what is packed next, and the transport while it is written to
+        self._transport: Transport | None = None
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -52,11 +60,27 @@ class MavlinkLink:
             raise InputLost(f"cannot be opened: {_reason(error)}") from error
         self.sessions += 1
         try:
+            self._transport = transport
             self._serve(transport, stop)
         except (OSError, EOFError) as error:
             raise InputLost(f"lost: {_reason(error)}") from error
         finally:
-            transport.close()
+            with self._sending:
+                self._transport = None
+                transport.close()
+
+    def send(self, message: Any, voice: Any = None) -> bool:
+        """Send a pymavlink message, from any thread, as fusiond or with a voice (a pymavlink MAVLink) of one's own. Never
+        waits for the peer. False: the link is closed or takes nothing more, and the message is lost."""
+        with self._sending:
+            if self._transport is None:
+                return False
+            try:
+                taken = self._transport.write(self.talk.pack(message, voice))
+            except (OSError, EOFError):
+                return False  # the link's own thread finds it lost
+            self.sent += taken
+            return taken
 
     def _serve(self, transport: Transport, stop: Event) -> None:
         splitter = FrameSplitter(self.decoder.dialect)
@@ -66,12 +90,19 @@ class MavlinkLink:
             t_ns = self._clock.now_ns()
             for chunk in chunks:
                 for frame in splitter.feed(chunk):
+                    if self.talk.signing and not self.talk.signing.accepts(frame):
+                        continue
                     self.inbox.put(t_ns, frame)
-                    self.talk.hear(frame, t_ns)
+                    with self._sending:  # it may pack an answer
+                        self.talk.hear(frame, t_ns)
+                    for listen in self.listeners:
+                        listen(frame, t_ns)
             self.skipped_bytes = skipped_before + splitter.skipped_bytes
-            for said in self.talk.say(t_ns, alive=self._alive()):
-                transport.write(said)
-                self.sent += 1
+            while self.talk.news:
+                log.info("%s: %s", self.about, self.talk.news.pop(0))
+            with self._sending:
+                for said in self.talk.say(self._clock.now_ns(), alive=self._alive()):
+                    self.sent += transport.write(said)
 
     def decode(self, item: bytes, t_ns: int) -> list[Received]:
         """The events in a frame."""
@@ -85,7 +116,16 @@ class MavlinkLink:
         """What became of the frames so far, and of the link."""
         own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
         asked = {f"asked for {name}": wanted.asked for name, wanted in self.talk.wanted.items()}
-        return {**own, "reboots": self.talk.reboots, **asked, **self.decoder.counts}
+        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.talk.wanted.items()}
+        signing = self.talk.signing.counts if self.talk.signing else {}
+        return {**own, "reboots": self.talk.reboots, **asked, **rates, **signing, **self.decoder.counts}
+
+
+def link_of(inputs: Mapping[str, LiveInput[Any]], name: str) -> MavlinkLink:
+    """The link [mavlink.NAME] among the inputs of a run."""
+    link = inputs[f"mavlink.{name}"]
+    assert isinstance(link, MavlinkLink)
+    return link
 
 
 def _reason(error: OSError | EOFError) -> str:

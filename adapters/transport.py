@@ -13,10 +13,12 @@ pymavlink's own classes are of no use here: they print, sleep, take the end of a
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import time
 from collections.abc import Callable
+from threading import Lock
 from typing import Protocol
 
 import serial
@@ -28,13 +30,14 @@ MOST_PEERS = 16
 
 
 class Transport(Protocol):
-    """An open way to a peer. Every method may raise OSError or EOFError: the way is lost."""
+    """An open way to a peer. Every method may raise OSError or EOFError: the way is lost. One thread may read while
+    another writes; two must not write at once, nor one write to what is being closed."""
 
     def read(self, timeout_s: float) -> list[bytes]:
         """What has come, after waiting for it up to `timeout_s`."""
 
-    def write(self, data: bytes) -> None:
-        """Send to the peer, if there is one. What the line does not take at once is lost."""
+    def write(self, data: bytes) -> bool:
+        """Send a frame to the peer. False: it is lost, as there is no peer or the line takes nothing more. Never waits."""
 
     def close(self) -> None: ...
 
@@ -73,6 +76,27 @@ def _unix_socket(path: str) -> socket.socket:
     return made
 
 
+class Whole:
+    """Frames on a line that may take a part of one: the rest of it goes first the next time, so that none is torn."""
+
+    def __init__(self, write: Callable[[bytes], int]) -> None:
+        """`write` gives how many bytes the line took. It may raise BlockingIOError: none."""
+        self._write = write
+        self._rest = b""
+
+    def put(self, data: bytes) -> bool:
+        """Was the frame taken?"""
+        try:
+            if self._rest:
+                self._rest = self._rest[self._write(self._rest) :]
+            if not self._rest:
+                self._rest = data[self._write(data) :]
+                return True
+        except BlockingIOError:
+            return False
+        return False
+
+
 def _wait(sockets: list[socket.socket], timeout_s: float) -> list[socket.socket]:
     return select.select(sockets, [], [], timeout_s)[0]
 
@@ -96,11 +120,12 @@ class _Udp:
                 return found
         return found
 
-    def send(self, data: bytes, address: tuple[str, int]) -> None:
+    def send(self, data: bytes, address: tuple[str, int]) -> bool:
         try:
             self.socket.sendto(data, address)
         except (BlockingIOError, ConnectionRefusedError):
-            return  # a full buffer, or nobody listens there yet: a datagram is lost, as datagrams may be
+            return False  # a full buffer, or nobody listens there yet: a datagram is lost, as datagrams may be
+        return True
 
     def close(self) -> None:
         self.socket.close()
@@ -125,11 +150,12 @@ class _UdpIn(_Udp):
                 self._peers[peer] = now
         return [data for data, _ in received]
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         now = time.monotonic()
-        self._peers = {peer: heard for peer, heard in self._peers.items() if now - heard < FORGET_S}
-        for peer in self._peers:
-            self.send(data, peer)
+        peers = list(self._peers.items())  # at once: the reading thread adds to them
+        for peer in [peer for peer, heard in peers if now - heard >= FORGET_S]:
+            self._peers.pop(peer, None)
+        return sum(self.send(data, peer) for peer, heard in peers if now - heard < FORGET_S) > 0
 
 
 class _UdpOut(_Udp):
@@ -146,8 +172,8 @@ class _UdpOut(_Udp):
     def read(self, timeout_s: float) -> list[bytes]:
         return [data for data, _ in self.receive(timeout_s)]
 
-    def write(self, data: bytes) -> None:
-        self.send(data, self._address)
+    def write(self, data: bytes) -> bool:
+        return self.send(data, self._address)
 
 
 class _Stream:
@@ -158,6 +184,7 @@ class _Stream:
         connected.setblocking(False)
         if connected.family != socket.AF_UNIX:
             connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._out = Whole(connected.send)
 
     def read(self, timeout_s: float) -> list[bytes]:
         if not _wait([self.socket], timeout_s):
@@ -167,11 +194,8 @@ class _Stream:
             raise EOFError("closed by the peer")
         return [data]
 
-    def write(self, data: bytes) -> None:
-        try:
-            self.socket.send(data)
-        except BlockingIOError:
-            return  # the peer does not read: what we have to say will be said again
+    def write(self, data: bytes) -> bool:
+        return self._out.put(data)
 
     def close(self) -> None:
         self.socket.close()
@@ -184,42 +208,44 @@ class _TcpIn:
         self._listener = socket.create_server(address, backlog=1)
         self._listener.setblocking(False)
         self._peer: _Stream | None = None
+        self._changing = Lock()  # the peer may be dropped while another thread writes
 
     def read(self, timeout_s: float) -> list[bytes]:
         peer = self._peer
         ready = _wait([self._listener, *([peer.socket] if peer else [])], timeout_s)
         if self._listener in ready:
-            self._drop()
-            self._peer = _Stream(self._listener.accept()[0])
+            self._follow(_Stream(self._listener.accept()[0]))
             return []
         if not ready or peer is None:
             return []
         try:
             return peer.read(0)
         except (OSError, EOFError):
-            self._drop()
+            self._follow(None)
             return []
 
-    def write(self, data: bytes) -> None:
-        if self._peer:
+    def write(self, data: bytes) -> bool:
+        with self._changing:
             try:
-                self._peer.write(data)
+                return self._peer is not None and self._peer.write(data)
             except OSError:
-                self._drop()
+                return False  # the reading thread finds the peer gone
 
-    def _drop(self) -> None:
-        if self._peer:
-            self._peer.close()
-            self._peer = None
+    def _follow(self, peer: _Stream | None) -> None:
+        with self._changing:
+            if self._peer:
+                self._peer.close()
+            self._peer = peer
 
     def close(self) -> None:
-        self._drop()
+        self._follow(None)
         self._listener.close()
 
 
 class _Serial:
     def __init__(self, device: str, baud: int) -> None:
         self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+        self._out = Whole(lambda data: os.write(self._port.fileno(), data))  # pyserial's own spins on a full line
 
     def read(self, timeout_s: float) -> list[bytes]:
         ready, _, _ = select.select([self._port], [], [], timeout_s)
@@ -230,11 +256,8 @@ class _Serial:
             raise EOFError("the device is gone")
         return [data]
 
-    def write(self, data: bytes) -> None:
-        try:
-            self._port.write(data)
-        except serial.SerialTimeoutException:
-            return  # the line is slow: what we have to say will be said again
+    def write(self, data: bytes) -> bool:
+        return self._out.put(data)
 
     def close(self) -> None:
         self._port.close()

@@ -9,6 +9,9 @@ unix           trusted as it is (aim 0) while receipt - stamp is plausible: -FUT
                first stamp decides, so each has its result at once; trust is lost only by three stamps in a row over
                TRUST_LOST_AFTER, and regained by a plausible re-alignment, or when the least offset creeps back. Without
                it: least offset. A host ahead by less than PLAUSIBLE_LATENCY cannot be told from a slow link.
+boot + trips   (TIMESYNC) boot to the host's line by round trips, see `RoundTrips`; while that is plausible against the
+               least offset. Together with pairs it also tells the host's offset from Unix time, which is then the aim
+               of Unix stamps, trusted or not: so a host whose clock is wrong puts both where they belong.
 boot + pairs   (SYSTEM_TIME) boot to Unix by the least of Unix less boot, as boot is cut off to a millisecond; while
                Unix is trusted and the result is plausible against the least offset; else least offset.
 least offset   the least receipt - stamp of the clock, as a line with drift: see `OffsetFloor`.
@@ -35,8 +38,9 @@ from enum import Enum, auto
 from typing import Literal
 
 from fusiond.config import Config
-from fusiond.measurements import UNIX_CLOCK, ClockPair, Invalid, Measurement, Received
+from fusiond.measurements import HOST_CLOCK, UNIX_CLOCK, ClockPair, Invalid, Measurement, Received
 from fusiond.offset_floor import OffsetFloor
+from fusiond.round_trips import RoundTrips
 
 MILLISECOND = 1_000_000  # ns
 SECOND = 1_000 * MILLISECOND  # ns
@@ -56,7 +60,7 @@ STEP = 250 * MILLISECOND  # an aim farther off than this (and than slewing reach
 
 ABSURD = "sensor stamp is not positive"
 
-Method = Literal["arrival", "unix", "system_time", "least_offset"]
+Method = Literal["arrival", "unix", "timesync", "system_time", "least_offset"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +142,9 @@ class _Aligner:
         self._rows: dict[str, _Row] = {}
         self._pairs: OffsetFloor | None = None  # unix less boot
         self._odd_pair: int | None = None
+        self._trips = RoundTrips()
+        self.synchronised = False  # by round trips
+        self.bridge: int | None = None  # of the Unix clock: its offset by way of a synchronised boot clock
         self.trusted = self._unix is None and -FUTURE_TOLERANCE <= offset <= PLAUSIBLE_LATENCY  # boot: see learn_pair
         self._restart(_Piece(stamp, stamp, self._aim(receive)), stamp)
 
@@ -149,8 +156,19 @@ class _Aligner:
         self._latency = self._placed = 0
 
     @property
+    def begun(self) -> bool:
+        """Whether any stamp has come yet."""
+        return bool(self._pieces)
+
+    def floor_at(self, receive: int) -> int:
+        """The least offset, where any stamp has come."""
+        return self._floor.at(receive)
+
+    @property
     def anchored(self) -> bool:
-        """Whether the aim comes from Unix time, not from receipts."""
+        """Whether the aim comes from round trips or Unix time, not from receipts."""
+        if self.synchronised or self.bridge is not None:
+            return True
         return self.trusted and (self._unix is None or self._unix.trusted)
 
     def _aim(self, receive: int) -> int:
@@ -159,7 +177,10 @@ class _Aligner:
             self.trusted = 0 <= floor <= PLAUSIBLE_LATENCY
         if not self.anchored:
             return floor
-        return min(self._pairs.at(receive) if self._pairs else 0, floor + FUTURE_TOLERANCE)
+        aim = self._trips.at(receive) if self.synchronised else self.bridge
+        if aim is None:
+            aim = self._pairs.at(receive) if self._pairs else 0
+        return min(aim, floor + FUTURE_TOLERANCE)
 
     def place(self, source: str, stamp: int, receive: int) -> int | str:
         """The stamp on the time line, or why it is invalid. Learns from it."""
@@ -167,30 +188,33 @@ class _Aligner:
         self.samples += 1
         if not self._pieces:
             self._begin(stamp, receive, offset)
-        piece = self._piece(stamp, receive)
+        last = self._pieces[-1]
+        piece = last if last.start <= stamp <= last.end else self._piece(stamp, receive)
         aligned = stamp + piece.at(stamp)
         late = receive - aligned
-        usual = self._usual.get(source, 0)
+        usual = self._usual.get(source, 0) if self._usual else 0
         verdict = FITS if -FUTURE_TOLERANCE <= late <= SLOW else self._judge(stamp, late, usual)
         if verdict is FITS:
             if self._rows or late < usual:
                 self._fits(source, late)
+            self._floor.add(receive, offset)
         elif (agreed := self._agreed(verdict, source, stamp, receive, late)) is not None:
             self.resets += 1
             self._begin(stamp, receive, agreed)
-            piece = self._pieces[-1]
+            last = piece = self._pieces[-1]
             aligned = stamp + piece.shift
         elif verdict in _REASONS:
             self.strays += 1
             return _REASONS[verdict]
-        if verdict is FITS or verdict is _Verdict.SLOW:
+        if verdict is _Verdict.SLOW:
             self._floor.add(receive, offset)
         if piece.step:
             self.resets += 1
             self._restart(replace(piece, step=False), stamp)
-        elif piece.end > self._pieces[-1].end:
+        elif piece is not last and piece.end > last.end:
             self._pieces.append(piece)
-        self._newest = max(self._newest, stamp)
+        if stamp > self._newest:
+            self._newest = stamp
         self._latency += receive - aligned
         self._placed += 1
         return aligned
@@ -270,11 +294,33 @@ class _Aligner:
         self.trusted = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.trusted else 2)
         self.complaint = "" if self.trusted else "SYSTEM_TIME contradicts receipts"
 
+    def learn_trip(self, stamp: int, sent: int, receive: int) -> None:
+        """Take a reading of this clock made between `sent` and `receive`."""
+        if not self._pieces:
+            return
+        self._trips.add(stamp, sent, receive)
+        offset = self._trips.at(receive)
+        if offset is not None:
+            future = offset - self._floor.at(receive)
+            self.synchronised = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.synchronised else 2)
+            if not self.synchronised:
+                self.complaint = "TIMESYNC contradicts receipts"
+
+    def bridge_to(self, unix: _Aligner, receive: int) -> None:
+        """Tell the Unix clock its offset from the host's, where this clock's offset from both is known."""
+        offset = self._trips.at(receive) if self._pieces and self.synchronised and self._pairs else None
+        if offset is not None and self._pairs and unix.begun:
+            bridge = offset - self._pairs.at(receive)
+            plausible = -PLAUSIBLE_LATENCY <= bridge - unix.floor_at(receive) <= FUTURE_TOLERANCE
+            unix.bridge = bridge if plausible else None
+
     def report(self) -> ClockReport:
         offset = self._pieces[-1].at(self._newest) if self._pieces else 0
         method: Method = "least_offset"
         note = self.complaint
-        if self.anchored:
+        if self._pieces and (self.synchronised or self.bridge is not None):
+            method, note = "timesync", ""
+        elif self.anchored:
             method = "unix" if self._unix is None else "system_time"
         elif self._unix is None:
             note = f"host clock and Unix stamps differ by {offset / SECOND:+.3f} s"
@@ -330,6 +376,11 @@ class Clock:
     def _learn(self, received: Received, pair: ClockPair) -> None:
         """Both stamps of a pair teach their clocks; the pair is taken if both fit."""
         stamp = received.t_sensor_ns
+        if pair.clock == HOST_CLOCK and received.clock and stamp is not None and stamp > 0:
+            asked = self._aligner(received.clock)
+            asked.learn_trip(stamp, pair.t_ns, received.t_receive_ns)
+            asked.bridge_to(self._aligners[UNIX_CLOCK], received.t_receive_ns)
+            return
         if received.clock != UNIX_CLOCK or pair.clock == UNIX_CLOCK or stamp is None or min(stamp, pair.t_ns) <= 0:
             return
         boot = self._aligner(pair.clock)
@@ -347,5 +398,7 @@ def _delays(config: Config) -> dict[str, int]:
     for name, gnss in config.gnss.items():
         delays[f"{name}.position"] = gnss.delay_ms
         delays[f"{name}.velocity"] = gnss.delay_ms + gnss.velocity_delay_ms
-    delays |= {name: config.can[wheel.bus].delay_ms + wheel.delay_ms for name, wheel in config.wheel.items()}
+    for name, wheel in config.wheel.items():
+        delays[name] = wheel.delay_ms + (config.can[wheel.bus].delay_ms if wheel.bus else 0.0)
+    delays |= {name: barometer.delay_ms for name, barometer in config.barometer.items()}
     return {name: round(delay * MILLISECOND) for name, delay in delays.items()}

@@ -27,6 +27,8 @@ def description(config: Config) -> Iterator[str]:
         yield from _gnss(name, gnss)
     for name, wheel in config.wheel.items():
         yield from _wheel(name, wheel)
+    for name, barometer in config.barometer.items():
+        yield f"barometer    {name}: {barometer.message} of {barometer.link}, {_delay(barometer.delay_ms)}"
     constraints = [
         f"no sideways speed at {_place(motion.point_m)} above {motion.minimum_speed_mps:g} m/s" * motion.non_holonomic,
         f"zero velocity and rotation after {motion.still_after_s:g} s at rest" * motion.standstill,
@@ -37,6 +39,12 @@ def description(config: Config) -> Iterator[str]:
     publish = config.publish
     yield f"publishes    fusiond/{config.vehicle.name}/state at {publish.rate_hz:g} Hz as {publish.encoding}"
     yield f"Zenoh        {_zenoh(config)}"
+    if config.mcap.folder is not None:
+        yield f"MCAP         files in {config.path(config.mcap.folder)}, {config.mcap.total_mb:g} MB at most"
+    if config.foxglove.enabled:
+        yield f"Foxglove     ws://{config.foxglove.host}:{config.foxglove.port}"
+    if config.prometheus.enabled:
+        yield f"Prometheus   http://{config.prometheus.host}:{config.prometheus.port}/metrics"
 
 
 def _imu(name: str, imu: Imu) -> Iterator[str]:
@@ -56,8 +64,10 @@ def _gnss(name: str, gnss: Gnss) -> Iterator[str]:
 
 
 def _wheel(name: str, wheel: Wheel) -> Iterator[str]:
-    signal = f"{wheel.message}.{wheel.signal}"
-    yield f"wheel        {name}: {signal} of {wheel.bus} in {wheel.unit}, {_delay(wheel.delay_ms)}"
+    where = f"WHEEL_DISTANCE[{wheel.index}] of {wheel.link}"
+    if wheel.bus is not None:
+        where = f"{wheel.message}.{wheel.signal} of {wheel.bus} in {wheel.unit}"
+    yield f"wheel        {name}: {where}, {_delay(wheel.delay_ms)}"
     kind = "steered" if wheel.steered else "not steered"
     sign = "amount only" if wheel.unsigned and not wheel.direction_signal else "with direction"
     factor = f", times {wheel.scale:g}" if wheel.scale != 1 else ""
@@ -67,6 +77,7 @@ def _wheel(name: str, wheel: Wheel) -> Iterator[str]:
         for signal, rule in (
             (wheel.valid_signal, f"must be {wheel.valid_value}"),
             (wheel.counter_signal, "must change"),
+            (wheel.checksum, "checksum must be right"),
             (wheel.direction_signal, f"= {wheel.reverse_value} means backwards"),
         )
         if signal
@@ -122,7 +133,7 @@ def oddities(config: Config) -> Iterator[str]:
             yield f"{key}: {_place(point)} is far from the IMU; is it in metres?"
         elif not any(point):
             yield f"{key}: 0 0 0 puts it where the IMU is; is it measured?"
-    if config.can and not config.wheel:
+    if config.can and all(wheel.bus is None for wheel in config.wheel.values()):
         yield "no [wheel.NAME] uses the [can.NAME] buses: nothing of them will be read"
 
 
@@ -134,7 +145,7 @@ def _delays(config: Config) -> Iterator[tuple[str, float]]:
         if gnss.use_velocity:
             yield f"gnss.{name} (velocity)", gnss.delay_ms + gnss.velocity_delay_ms
     for name, wheel in config.wheel.items():
-        yield f"wheel.{name}", wheel.delay_ms + config.can[wheel.bus].delay_ms
+        yield f"wheel.{name}", wheel.delay_ms + (config.can[wheel.bus].delay_ms if wheel.bus else 0.0)
 
 
 def _points(config: Config) -> Iterator[tuple[str, Vector3]]:

@@ -43,11 +43,22 @@ class WheelSpeed(Struct, frozen=True, gc=False):
     """Speed of one wheel's circumference along its rolling direction, positive forward."""
 
     speed: float  # m/s
+    sigma: float = 0.0  # m/s, one standard deviation of this reading, on top of what the configuration says
+
+
+class Pressure(Struct, frozen=True, gc=False):
+    """Static air pressure."""
+
+    absolute: float  # Pa
+    temperature: float  # K, of the sensor
 
 
 class ClockPair(Struct, frozen=True, gc=False):
     """One instant read from two clocks at once (MAVLink SYSTEM_TIME): `Received.t_sensor_ns` on `Received.clock` is
-    `t_ns` on `clock`. It aligns clocks and never reaches the filter."""
+    `t_ns` on `clock`. It aligns clocks and never reaches the filter.
+
+    With HOST_CLOCK as `clock` it is the answer to a question (MAVLink TIMESYNC), asked at `t_ns` of the host's time line:
+    the other clock was read at some instant between that and the receipt."""
 
     clock: str
     t_ns: int
@@ -59,7 +70,7 @@ class Invalid(Struct, frozen=True, gc=False):
     reason: str
 
 
-Payload = ImuSample | GnssPosition | GnssVelocity | WheelSpeed
+Payload = ImuSample | GnssPosition | GnssVelocity | WheelSpeed | Pressure
 AnyPayload = Payload | ClockPair | Invalid
 
 
@@ -95,6 +106,7 @@ class Measurement(Struct, frozen=True, gc=False):
 
 
 UNIX_CLOCK = "unix"
+HOST_CLOCK = "host"  # that of the receipts
 
 
 def boot_clock(link: str, system: int = 1) -> str:

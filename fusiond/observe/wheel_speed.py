@@ -34,11 +34,12 @@ def parameters(wheel: Wheel) -> Array:
 
 
 def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
-    """Speed [m/s], its variance (the white noise and that of rounding to a quantum, quantum^2/12), and the time over which
-    its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the same
-    from reading to reading. Raises Unusable."""
+    """Speed [m/s], its variance (white noise, rounding to a quantum, quantum^2/12, and the reading's own), and the time over
+    which its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the
+    same from reading to reading. Raises Unusable."""
     within((reading.speed,), SPEED_LIMIT, "impossible speed")
-    variance, alike = square(wheel.sigma_mps) + square(wheel.quantum_mps) / 12, wheel.correlation_s
+    variance = square(wheel.sigma_mps) + square(wheel.quantum_mps) / 12 + square(reading.sigma)
+    alike = wheel.correlation_s
     if abs(reading.speed) < wheel.least_mps:
         return reading.speed, variance + square(wheel.least_mps) / 3, max(alike, SLOW_ALIKE)
     return reading.speed, variance, alike

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from fusiond import config
 from fusiond.measurements import Invalid, Received, WheelSpeed
-from fusiond_adapters.can import CanDecoder
+from fusiond.toml_file import ConfigError
+from fusiond_adapters.can import CanDecoder, parameter_group
+from fusiond_adapters.can_checksums import is_right
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -154,14 +156,14 @@ def test_a_bus_without_wheels_needs_no_dbc(tmp_path: Path) -> None:
     ],
 )
 def test_what_the_dbc_lacks_is_named(folder: Path, text: str, complaint: str) -> None:
-    with pytest.raises(config.ConfigError, match=complaint):
+    with pytest.raises(ConfigError, match=complaint):
         decoder(folder, text)
 
 
 @pytest.mark.parametrize("content", [b"", b"no DBC at all", b"\xff\x00\xfe", DBC[:300].encode()])
 def test_a_broken_dbc_is_named(folder: Path, content: bytes) -> None:
     (folder / "body.dbc").write_bytes(content)
-    with pytest.raises(config.ConfigError, match=r"can\.body\.dbc: .*body\.dbc: not a valid DBC file"):
+    with pytest.raises(ConfigError, match=r"can\.body\.dbc: .*body\.dbc: not a valid DBC file"):
         decoder(folder, wheel())
 
 
@@ -187,3 +189,105 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> CanDecoder:
 def test_no_content_raises(shared: CanDecoder, frame: tuple[int, bool], data: bytes) -> None:
     for event in shared.decode(*frame, data, 0):
         assert isinstance(event.payload, Invalid) or math.isfinite(event.payload.speed)  # type: ignore[union-attr]
+
+
+# --- Values, checksums and ids of particular makers
+
+
+def test_values_that_mean_not_available(folder: Path) -> None:
+    reader = decoder(folder, wheel(more="not_available_from = 65534"))
+    assert payloads(reader.decode(256, False, axle(LEFT=655.33), 0)) == [WheelSpeed(pytest.approx(655.33 / 3.6))]
+    assert payloads(reader.decode(256, False, axle(LEFT=655.34), 0)) == [Invalid("not available")]
+    assert payloads(reader.decode(256, False, axle(LEFT=655.35), 0)) == [Invalid("not available")]
+
+
+def test_a_base_signal_is_added(folder: Path) -> None:
+    more = 'base_signal = "RIGHT"\nunit = "m/s"'
+    assert payloads(decoder(folder, wheel(more=more)).decode(256, False, axle(LEFT=36.0, RIGHT=-1.5), 0)) == [
+        WheelSpeed(34.5)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "arbitration_id", "data"),
+    [
+        ("toyota", 0x2E4, "00000000C8B4"),  # 6 + 02 + E4 + C8 = 1B4
+        ("honda", 0x1D0, "1C2038447090E136"),  # the digits of id and data are 82: 8 - 82 = 6 of 16
+        ("honda", 0x18DAB0F1, "010000000000000F"),  # with those of the id they are 60: 8 + 3 - 60 = F of 16
+        ("hyundai", 0x386, "8044814482448344"),  # 12 bits set, 12 ^ 9 = 5: 1 in byte 5, 1 in byte 7
+        ("tesla", 0x175, "01020304050607" "92"),  # 01 + 75 + 1C = 92
+    ],
+)
+def test_checksums(kind: str, arbitration_id: int, data: str) -> None:
+    content = bytes.fromhex(data)
+    assert is_right(kind, arbitration_id, content)
+    for place in range(8 * len(content)):
+        damaged = bytearray(content)
+        damaged[place // 8] ^= 1 << place % 8
+        if kind == "hyundai" and place in (14, 15, 30, 31):
+            continue  # its counter is not covered
+        assert not is_right(kind, arbitration_id, bytes(damaged)), place
+    assert not is_right(kind, arbitration_id, b"")
+
+
+def test_a_wrong_checksum_is_counted_against_the_wheels_that_ask_for_it(folder: Path) -> None:
+    unasked = wheel("right", signal="RIGHT", more='unit = "m/s"')
+    reader = decoder(folder, wheel(more='checksum = "honda"'), unasked)
+    assert payloads(reader.decode(256, False, axle(LEFT=36.0, RIGHT=5.0), 0)) == [Invalid("checksum"), WheelSpeed(5.0)]
+
+
+def test_j1939_by_the_key_or_by_the_dbc(folder: Path) -> None:
+    exact = wheel("exact", "EXACT", "SPEED", 'unit = "m/s"')
+    ten = b"\x00\x00\x20\x41" + bytes(4)
+    by_id = decoder(folder, exact)
+    assert (by_id.keys, by_id.groups) == ({0x98FEBFFE}, frozenset())
+    text = BASE.replace("[mavlink", "j1939 = true\n[mavlink") + exact
+    by_group = CanDecoder(config.parse(text, folder / "c.toml"), "body")
+    assert (by_group.keys, by_group.groups) == (frozenset(), {65215})
+    for arbitration_id, found in ((0x18FEBFFE, True), (0x0CFEBF0B, True), (0x18FEC0FE, False), (0x19FEBFFE, False)):
+        assert bool(by_group.decode(arbitration_id, True, ten, 0)) == found, hex(arbitration_id)
+    assert by_group.decode(0x7FF, False, ten, 0) == []
+    assert parameter_group(0x18EF1234) == 0xEF00  # with a destination, which is no part of it
+
+
+def test_a_unit_that_contradicts_the_dbc_is_told(folder: Path) -> None:
+    assert decoder(folder, wheel()).warnings == []
+    (warning,) = decoder(folder, wheel(more='unit = "mph"')).warnings
+    assert warning == "wheel.left.unit: is mph, but the DBC says that LEFT is in km/h"
+
+
+# --- Signals are cut out of the data by shifts: the same numbers as cantools gives
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> tuple[str, int]:
+    """The DBC text of a message of one signal, and the message's size."""
+    size = draw(st.integers(1, 8))
+    length = draw(st.integers(1, 8 * size))
+    begin = draw(st.integers(0, 8 * size - length))
+    big, signed = draw(st.booleans()), draw(st.booleans())
+    start = begin // 8 * 8 + 7 - begin % 8 if big else begin
+    scale, offset = draw(st.sampled_from([1, 3, -2, 0.01, 0.1, -0.5])), draw(st.sampled_from([0, -40, 0.5, -67.67]))
+    signal = f'{start}|{length}@{int(not big)}{"-" if signed else "+"} ({scale},{offset}) [0|0] "m/s" E'
+    return f'VERSION ""\nBU_: E\nBO_ 1 M: {size} E\n SG_ S : {signal}\n', size
+
+
+@settings(max_examples=100, deadline=None)
+@given(layouts(), st.binary(max_size=10))
+def test_a_signal_is_what_cantools_decodes(
+    tmp_path_factory: pytest.TempPathFactory, layout: tuple[str, int], data: bytes
+) -> None:
+    text, size = layout
+    folder = tmp_path_factory.mktemp("layout")
+    (folder / "body.dbc").write_text(text)
+    (event,) = decoder(folder, wheel(message="M", signal="S", more='unit = "m/s"')).decode(1, False, data, 0)
+    message = cantools.database.load_string(text, "dbc").messages[0]
+    expected = message.decode_simple(data, decode_choices=False, allow_truncated=True)
+    assert event.payload == (WheelSpeed(expected["S"]) if "S" in expected else Invalid("short frame"))
+    assert "S" in expected or len(data) < size
+
+
+def test_signals_that_share_bits_are_decoded_all_the_same(folder: Path) -> None:
+    (folder / "body.dbc").write_text(DBC.replace(" SG_ COUNTER", ' SG_ BOTH : 0|32@1+ (1,0) [0|0] "" E\n SG_ COUNTER'))
+    (event,) = decoder(folder, wheel()).decode(256, False, bytes([100, 0, 0, 0, 0, 0, 0, 0]), 0)
+    assert event.payload == WheelSpeed(100 * 0.01 * (1 / 3.6))

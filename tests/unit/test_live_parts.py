@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
+from itertools import pairwise
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 import pytest
@@ -15,7 +19,7 @@ from fusiond.reload import changes
 from fusiond_adapters.can_bus import CanBus, CanFrame
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.inputs import Inbox
-from fusiond_adapters.logs.record import RETRY_RECORDS, Recorder
+from fusiond_adapters.logs.record import RETRY_NS, Recorder
 from fusiond_adapters.mavlink_talk import SECOND, MavlinkTalk
 from fusiond_adapters.systemd import Notifier, watchdog_s
 from fusiond_adapters.transport import opener
@@ -40,6 +44,13 @@ def test_nothing_is_asked_of_a_ground_station(settings: Config) -> None:
     talk.hear(bytes(message.pack(station)), 0)
     assert talk.target is None
     assert requests(talk.say(SECOND, alive=True)) == []
+
+
+def test_nothing_is_asked_of_a_component_that_is_not_the_configured_one(settings: Config) -> None:
+    link = msgspec.structs.replace(settings.mavlink["fc"], component=2)
+    talk = MavlinkTalk(msgspec.structs.replace(settings, mavlink={"fc": link}), "fc")
+    talk.hear(Autopilot().heartbeat(), 0)
+    assert talk.target is None
 
 
 def test_asks_again_ever_more_seldom_until_the_rate_is_met(settings: Config) -> None:
@@ -80,6 +91,40 @@ def test_heartbeats_stop_with_the_estimator(settings: Config) -> None:
     assert told == [1, 0] * 5 + [0] * 10
 
 
+def questions(said: list[bytes]) -> list[int]:
+    return [m.ts1 for m in parsed(b"".join(said)) if m.get_type() == "TIMESYNC" and m.tc1 == 0]
+
+
+def test_time_is_asked_for_fast_at_first_and_after_a_reboot(settings: Config) -> None:
+    talk, autopilot = MavlinkTalk(settings, "fc"), Autopilot()
+    assert questions(talk.say(0, alive=True)) == []  # whom?
+    talk.hear(autopilot.heartbeat(), 0)
+    step = SECOND // 20
+    asked = [k * step for k in range(200) if questions(talk.say(k * step, alive=True))]
+    assert asked[:20] == [k * 2 * step for k in range(20)]
+    assert {b - a for a, b in pairwise(asked[20:])} == {SECOND}
+    (stamp,) = questions(talk.say(11 * SECOND + 123_456, alive=True))
+    assert abs(stamp - (11 * SECOND + 123_456)) < 1000 and stamp % 1000 == 117
+    for boot_ms in (10_000, 100):
+        talk.hear(autopilot.system_time(boot_ms), 12 * SECOND)
+    assert questions(talk.say(12 * SECOND + 1, alive=True)) and questions(talk.say(12 * SECOND + 3 * step, alive=True))
+
+
+def test_what_changes_is_told_once(settings: Config) -> None:
+    talk, autopilot = MavlinkTalk(settings, "fc"), Autopilot()
+    talk.hear(autopilot.heartbeat(), 0)
+    for second in range(13):
+        for _ in range(0 if second < 6 else 100):
+            talk.hear(autopilot.imu(), second * SECOND)
+        talk.say(second * SECOND, alive=True)
+    told = [line for line in talk.news if "IMU" in line or "autopilot" in line]
+    assert told == [
+        f"the autopilot is system {SYSTEM}, component 1",
+        "HIGHRES_IMU comes at 0 Hz, wanted at 100 Hz",
+        "HIGHRES_IMU comes at 100 Hz, wanted at 100 Hz",
+    ]
+
+
 def test_an_overtaken_frame_is_no_reboot(settings: Config) -> None:
     talk, autopilot = MavlinkTalk(settings, "fc"), Autopilot()
     talk.hear(autopilot.heartbeat(), 0)
@@ -118,10 +163,24 @@ def test_black_box_survives_a_disk_that_fails(tmp_path: Path) -> None:
     folder = tmp_path / "box"
     with Recorder(folder, file_mb=1, total_mb=2) as box:
         folder.rmdir()
-        for number in range(RETRY_RECORDS + 1):
+        for number in range(100):
             box.add("can.log", number, b"x")
-    assert (box.written, box.lost) == (0, RETRY_RECORDS + 1)
+    assert (box.written, box.lost) == (0, 100)
     assert box.error == "No such file or directory"
+
+
+def test_black_box_goes_on_when_there_is_room_again(tmp_path: Path) -> None:
+    class FullAtFirst(Recorder):
+        def _open(self, kind: str, t_ns: int) -> BinaryIO:
+            if t_ns < RETRY_NS // 2:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super()._open(kind, t_ns)
+
+    with FullAtFirst(tmp_path, file_mb=1, total_mb=2) as box:
+        for t_ns, record in ((0, b"no room"), (RETRY_NS - 1, b"too early"), (RETRY_NS, b"again")):
+            box.add("can.log", t_ns, record)
+    assert (box.written, box.lost, box.error) == (1, 2, None)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"again"]
 
 
 def test_can_frames_as_candump_writes_them(settings: Config) -> None:

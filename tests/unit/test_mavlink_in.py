@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from fusiond import config
 from fusiond.measurements import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, Received
+from fusiond.toml_file import ConfigError
 from fusiond_adapters.mavlink import Dialect, FrameSplitter, MavlinkDecoder, frame_length, message_id
 
 UNIX_US = 1_700_000_000_000_000
@@ -269,7 +270,7 @@ def test_counts_of_lost_and_damaged_frames() -> None:
 @pytest.mark.parametrize(("name", "missing"), [("martian", "known: .*common"), ("minimal", "SYSTEM_TIME|HIGHRES_IMU")])
 def test_a_dialect_that_does_not_do(name: str, missing: str) -> None:
     settings_ = config.parse(f'[mavlink.fc]\ndialect = "{name}"\n[imu.imu0]\nlink = "fc"')
-    with pytest.raises(config.ConfigError, match=f"mavlink.fc.dialect.*({missing})"):
+    with pytest.raises(ConfigError, match=f"mavlink.fc.dialect.*({missing})"):
         MavlinkDecoder(settings_, "fc")
 
 
