@@ -11,15 +11,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib import get_data_path
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from fusiond import config, demo
 from fusiond.comparison import Truth, Window, displacement, parse_truth
-from fusiond.replay import Options, replay
+from fusiond.messages import EventMessage, HealthMessage, Message, StateMessage
+from fusiond.replay import Options, Replay, Wants, replay
 from fusiond.report import Summary
+from fusiond.top import View, screen
+from fusiond_adapters.logs.merge import open_logs
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -175,8 +179,48 @@ def arrow(ax: Axes, tail: tuple[float, float], head: tuple[float, float], colour
     ax.annotate("", head, tail, arrowprops=look)
 
 
+# --- What `fusiond top` shows
+
+TOP_SECOND = 62.0  # of the bundled drive: eight seconds into the tunnel
+TOP_COLUMNS = 122
+INKS = {"plain": "#d8d8d8", "dim": "#808080", "bold": "#ffffff", "green": "#50c878", "yellow": "#f0c040", "red": "#ff6060"}
+COLUMN, ROW, MARGIN = 8, 17, 12  # pixels
+PLAIN, BOLD = "DejaVuSansMono", "DejaVuSansMono-Bold"  # fonts that come with matplotlib
+
+
+def draw_top() -> None:
+    """The screen of `fusiond top` in the bundled drive."""
+    settings = config.load(demo.DRIVE / "fusiond.toml")
+    view = View()
+    until_ns: list[int] = []
+
+    def take(message: Message) -> None:
+        if isinstance(message, StateMessage):
+            until_ns[:] = until_ns or [message.t_ns + round(TOP_SECOND * 1e9)]
+        if isinstance(message, StateMessage | HealthMessage | EventMessage) and message.t_ns <= until_ns[0]:
+            view.take(message)
+
+    logs = open_logs([str(demo.DRIVE / log) for log in demo.LOGS], settings)
+    Replay(settings, Wants(50.0, on_message=[take])).run(logs)
+    lines = screen(view, 0.0, TOP_COLUMNS, 30)
+    picture = Image.new("RGB", (TOP_COLUMNS * COLUMN + 2 * MARGIN, len(lines) * ROW + 2 * MARGIN), "#101418")
+    folder = Path(get_data_path(), "fonts", "ttf")
+    fonts = {name: ImageFont.truetype(str(folder / f"{name}.ttf"), 13) for name in (PLAIN, BOLD)}
+    pen = ImageDraw.Draw(picture)
+    for row, line in enumerate(lines):
+        column = 0
+        for span in line:
+            place = MARGIN + column * COLUMN, MARGIN + row * ROW
+            pen.text(place, span.text, INKS[span.colour], fonts[BOLD if span.colour == "bold" else PLAIN])
+            column += len(span.text)
+    path = IMAGES / "top.png"
+    picture.save(path)
+    shrink(path)
+
+
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     draw_rewind()
     draw_demo()
     draw_arrival()
+    draw_top()

@@ -1,4 +1,4 @@
-"""The command line: run, replay, check, simulate, demo."""
+"""The command line: run, top, replay, check, simulate, demo."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from fusiond.describe import description, oddities
 from fusiond.replay import Options, OutputError, UsageError, parse_interval, parse_withheld, replay
 from fusiond.simulation import scenario
 from fusiond.toml_file import ConfigError
+from fusiond_adapters import journal
 from fusiond_adapters.can import CanDecoder
 from fusiond_adapters.logs import LogError
 from fusiond_adapters.logs.write import write_drive
@@ -29,6 +30,9 @@ RUN = """\
 Take the live inputs of a configuration and publish the state over Zenoh, until SIGTERM or SIGINT. An input that is away
 is waited for. SIGHUP reloads the configuration: connections, message rates and [record] change while running; with
 anything else changed the reload is refused as a whole, and the log says why."""
+TOP = """\
+Show the state of a running vehicle, what becomes of the measurements of each source, latencies, inputs, outputs and the
+latest events, as published over Zenoh. Yellow: look at it; red: out of order. q ends it. Without a terminal: one screen."""
 REPLAY = """\
 Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
 belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
@@ -59,6 +63,15 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
     run.set_defaults(run=run_daemon)
     _add_replay(commands)
+    watch = _add(commands, "top", "show a running vehicle's state, sources, latencies and health in the terminal")
+    watch.description, watch.epilog = TOP, f"example:\n  fusiond top --connect tcp/192.168.1.5:7447\n\n{EXIT_CODES}"
+    watch.add_argument("--vehicle", metavar="NAME", help="which one; default: the only one that is there")
+    watch.add_argument(
+        "--connect", metavar="ENDPOINT", default="tcp/127.0.0.1:7447", help="fusiond or router; default: %(default)s"
+    )
+    watch.add_argument("--zenoh", metavar="FILE", help="Zenoh's own configuration file, for TLS and the like")
+    watch.add_argument("--once", action="store_true", help="print one screen as text, and end")
+    watch.set_defaults(run=run_top)
     check = _add(commands, "check", "say what a configuration is going to do, or what is wrong with it")
     check.epilog = "example:\n  fusiond check --config car.toml"
     check.add_argument("--config", metavar="C.toml", required=True, help="configuration file")
@@ -69,9 +82,10 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder to write to; made if need be")
     simulate.add_argument("--seed", metavar="N", type=_seed, help="in place of the scenario's seed")
     simulate.set_defaults(run=run_simulate)
-    show = _add(commands, "demo", "fuse a bundled drive, and explain what comes out")
+    show = _add(commands, "demo", "play a bundled drive to a running fusiond, and explain what comes out")
     show.epilog = "example:\n  fusiond demo --out out/demo"
     show.add_argument("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="default: out/demo")
+    show.add_argument("--speed", metavar="X", type=_positive, default=15.0, help="X times real time; default: 15")
     show.set_defaults(run=run_demo)
     return top
 
@@ -92,6 +106,7 @@ def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
     add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
     add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
+    add("--mcap", metavar="OUT.mcap", type=Path, help="write everything published, for Foxglove (extra `mcap`)")
     add("--plot", metavar="OUT.png", type=Path, help="draw the track and, with --truth, its errors (extra `plot`)")
     add(
         "--withhold",
@@ -135,14 +150,26 @@ def _seed(text: str) -> int:
 
 def run_daemon(arguments: argparse.Namespace) -> None:
     """fusiond run"""
-    from fusiond.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
+    from fusiond.daemon import Daemon, punctual_loop, serve  # noqa: PLC0415 - the other commands need none of its drivers
 
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+    journal.set_up()
 
     def load() -> config.Config:
         return config.load(arguments.config)
 
-    asyncio.run(serve(Daemon(load(), load)))
+    with asyncio.Runner(loop_factory=punctual_loop) as runner:
+        runner.run(serve(Daemon(load(), load)))
+
+
+def run_top(arguments: argparse.Namespace) -> None:
+    """fusiond top"""
+    from fusiond.client import ClientError  # noqa: PLC0415 - Zenoh is slow to import
+    from fusiond_adapters.top import run  # noqa: PLC0415
+
+    try:
+        run(arguments.connect, arguments.vehicle, arguments.zenoh, just_once=arguments.once)
+    except ClientError as error:
+        raise OutputError(str(error)) from error
 
 
 def run_replay(arguments: argparse.Namespace) -> None:
@@ -158,6 +185,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
         json=arguments.json,
         truth=arguments.truth,
         plot=arguments.plot,
+        mcap=arguments.mcap,
         withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
         window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
         rate_hz=arguments.rate,
@@ -172,11 +200,10 @@ def run_check(arguments: argparse.Namespace) -> None:
     loaded = config.load(arguments.config)
     for link in loaded.mavlink:
         MavlinkDecoder(loaded, link)
-    for bus in loaded.can:
-        CanDecoder(loaded, bus)
+    decoders = [CanDecoder(loaded, bus) for bus in loaded.can]
     for line in description(loaded):
         print(line)
-    odd = list(oddities(loaded))
+    odd = [*oddities(loaded), *(warning for decoder in decoders for warning in decoder.warnings)]
     for line in odd:
         print(f"warning: {line}")
     print(f"{arguments.config}: can be used" + (f", with {len(odd)} warning(s)" if odd else ""))
@@ -190,7 +217,8 @@ def run_simulate(arguments: argparse.Namespace) -> None:
 
 def run_demo(arguments: argparse.Namespace) -> None:
     """fusiond demo"""
-    demo.run(arguments.out)
+    journal.set_up(logging.ERROR)  # what the daemon would log on the way is explained at the end
+    demo.run(arguments.out, arguments.speed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

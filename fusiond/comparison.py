@@ -192,12 +192,13 @@ class Histogram:
         self.count = 0
         self.least, self.greatest = math.inf, -math.inf
 
-    def add(self, value: float) -> None:
+    def add(self, value: float, count: int = 1) -> None:
+        """Count a value, `count` times over."""
         place = math.floor(value / self._step)
         if not -self._last <= place <= self._last:
             place = self._last if place > 0 else -self._last
-        self._bins[place] += 1
-        self.count += 1
+        self._bins[place] += count
+        self.count += count
         if value < self.least:
             self.least = value
         if value > self.greatest:

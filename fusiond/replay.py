@@ -25,9 +25,11 @@ from fusiond.engine import SECOND, Engine
 from fusiond.fusion import Receipt
 from fusiond.kernel import Outcome
 from fusiond.measurements import ClockPair, Received
-from fusiond.messages import StateMessage, csv_header, csv_row
+from fusiond.messages import Message, StateMessage, csv_header, csv_row
 from fusiond.progress import shown
+from fusiond.publication import Publication
 from fusiond.report import DeadReckoningLog, Latencies, Publications, Span, Summary, source_report, to_json
+from fusiond.toml_file import ConfigError
 from fusiond.trace import Trace
 from fusiond_adapters.logs import LogError
 from fusiond_adapters.logs.merge import open_logs
@@ -56,6 +58,7 @@ class Withheld(NamedTuple):
 
 TickSink = Callable[[StateMessage, Errors | None], None]
 ReceiptSink = Callable[[Receipt], None]
+MessageSink = Callable[[Message], None]
 Pace = Callable[[int], None]
 
 
@@ -69,6 +72,7 @@ class Wants:
     pace: Pace | None = None  # called with the time of what comes next [ns from the first event]; may sleep
     on_tick: list[TickSink] = field(default_factory=list)
     on_receipt: list[ReceiptSink] = field(default_factory=list)
+    on_message: list[MessageSink] = field(default_factory=list)  # everything that a live run would publish at a tick
     window: Window = WHOLE  # of the comparison with the truth
 
 
@@ -79,9 +83,10 @@ class Replay:
         self.config = config
         self.events = self.clock_pairs = 0
         self._wants = wants
-        self._ticking = bool(wants.on_tick) or wants.truth is not None
+        self._ticking = bool(wants.on_tick or wants.on_message) or wants.truth is not None
         self.engine = Engine(config, wants.rate_hz, self._publish if self._ticking else None, wants.pace)
         self.fusion = self.engine.fusion
+        self._publication = Publication(config, self.engine) if wants.on_message else None
         self._withheld: Counter[str] = Counter()
         self._modes: Counter[str] = Counter()
         self._latencies = {source: Latencies() for source in config.sources()}
@@ -90,11 +95,12 @@ class Replay:
 
     def run(self, events: Iterable[Received]) -> None:
         """Take all events, in order of receipt."""
+        advance, take, pace = self.engine.advance, self._take, self._wants.pace
         for event in events:
-            self.engine.advance(event.t_receive_ns)
-            if self._wants.pace:
-                self._wants.pace(self.elapsed_ns)
-            self._take(event)
+            advance(event.t_receive_ns)
+            if pace:
+                pace(self.elapsed_ns)
+            take(event)
         self.engine.finish()
 
     @property
@@ -109,15 +115,16 @@ class Replay:
 
     def _take(self, event: Received) -> None:
         self.events += 1
-        if isinstance(event.payload, ClockPair):
-            self.clock_pairs += 1
         for held in self._wants.withheld:
             if event.source in held.sources and held.start_ns <= self.elapsed_ns < held.stop_ns:
                 self._withheld[event.source] += 1
                 return
         receipt = self.engine.take(event)
         if receipt is None:
+            self.clock_pairs += isinstance(event.payload, ClockPair)
             return
+        if self._publication:
+            self._publication.add(event, receipt)
         if receipt.outcome is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)
@@ -132,6 +139,10 @@ class Replay:
             self._comparison.add(since_start_ns, errors)
         for sink in self._wants.on_tick:
             sink(message, errors)
+        if self._publication:
+            for told in self._publication.at(since_start_ns, message):
+                for take in self._wants.on_message:
+                    take(told)
 
     def summary(self, config_name: str, logs: dict[str, dict[str, int]], warnings: list[str]) -> Summary:
         """What came out. There must have been an event."""
@@ -229,6 +240,7 @@ class Options:
     json: Path | None = None
     truth: Path | None = None
     plot: Path | None = None
+    mcap: Path | None = None
     withheld: Sequence[Withheld] = ()
     window: Window = WHOLE
     rate_hz: float | None = None  # default: the configuration's
@@ -299,7 +311,7 @@ def _read_truth(path: Path) -> Iterator[TruthRow]:
 
 def _add_outputs(options: Options, wants: Wants, stack: ExitStack) -> None:
     """Open what every tick goes to; what cannot be written is found before the work begins."""
-    outputs = [path for path in (options.csv, options.json, options.plot) if path]
+    outputs = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
     inputs = {Path(log).resolve() for log in options.logs} | ({options.truth.resolve()} if options.truth else set())
     for path in outputs:
         if path.resolve() in inputs:
@@ -317,16 +329,36 @@ def _add_outputs(options: Options, wants: Wants, stack: ExitStack) -> None:
             file.write(csv_row(message) + "\n")
 
         wants.on_tick.append(write_row)
+    if options.mcap:
+        wants.on_message.append(_mcap_file(options.mcap, options.config, stack))
     if options.publish:
         wants.on_tick.append(_publisher(options.config, stack))
 
 
+def _mcap_file(path: Path, config: Config, stack: ExitStack) -> MessageSink:
+    try:
+        from fusiond_adapters.foxglove import Converter  # noqa: PLC0415 - needs the extra `mcap`
+        from fusiond_adapters.mcap import McapFile  # noqa: PLC0415
+    except ConfigError as error:
+        raise UsageError(f"--mcap: {error}") from error
+
+    with _delivering(path):
+        file = stack.enter_context(McapFile(path, config))
+    converter = Converter()
+
+    def write(message: Message) -> None:
+        for record in converter.records(message):
+            file.add(record)
+
+    return write
+
+
 def _publisher(config: Config, stack: ExitStack) -> TickSink:
-    from fusiond_adapters.zenoh import PublishError, ZenohStatePublisher, open_session  # noqa: PLC0415 - slow to import
+    from fusiond_adapters.zenoh import PublishError, ZenohPublisher, open_session  # noqa: PLC0415 - slow to import
 
     try:
         session = stack.enter_context(open_session(config.zenoh, config.directory))
-        publisher = stack.enter_context(ZenohStatePublisher(session, config.vehicle.name, config.publish.encoding))
+        publisher = stack.enter_context(ZenohPublisher(session, config.vehicle.name, config.publish.encoding))
     except PublishError as error:
         raise OutputError(str(error)) from error
 

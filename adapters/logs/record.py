@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
+from collections.abc import Set
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Condition, Thread
@@ -18,8 +19,29 @@ from typing import BinaryIO
 MEGABYTE = 1_000_000
 MOST_WAITING = 100_000  # records between the engine and the disk
 FLUSH_S = 1.0  # what is lost at a crash, at the most
-RETRY_RECORDS = 10_000  # after an error so many records are passed over before the disk is tried again
+RETRY_NS = 5_000_000_000  # after an error records are passed over for so long before the disk is tried again
 NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-\w+\.(tlog|log)")  # nothing else in the folder is ever removed
+
+
+def file_name(t_ns: int, kind: str) -> str:
+    """The name of a file whose first record is of that instant."""
+    instant = datetime.fromtimestamp(t_ns // 10**9, UTC)
+    return f"{instant:%Y%m%dT%H%M%S}.{t_ns % 10**9 // 1000:06d}Z-{kind}"
+
+
+def make_room(
+    folder: Path, name: re.Pattern[str], file_bytes: int, total_bytes: int, open_files: Set[Path] = frozenset()
+) -> None:
+    """Remove the oldest of the files so named, as long as one more full one could exceed the limit. Raises OSError."""
+    files = sorted(path for path in folder.iterdir() if name.fullmatch(path.name))
+    sizes = {path: file_bytes if path in open_files else path.stat().st_size for path in files}
+    total = sum(sizes.values()) + file_bytes
+    for path in files:
+        if total <= total_bytes:
+            return
+        if path not in open_files:
+            path.unlink()
+            total -= sizes[path]
 
 
 class Recorder:
@@ -38,7 +60,8 @@ class Recorder:
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         self._changed = Condition()
         self._ending = False
-        self._pass_over = 0
+        self._next_try_ns = 0  # records stamped earlier are passed over
+        self._last_ns = 0  # stamp of the last record given to a file
         self._thread = Thread(target=self._run, name="record")
         self._thread.start()
 
@@ -66,14 +89,13 @@ class Recorder:
                 for file, _ in self._files.values():
                     file.flush()
             except OSError as error:
-                self._fail(error)
+                self._fail(error, self._last_ns)
             if ending:
                 self._close_files()
                 return
 
     def _write(self, kind: str, t_ns: int, record: bytes) -> None:
-        if self._pass_over:
-            self._pass_over -= 1
+        if t_ns < self._next_try_ns:
             self.lost += 1
             return
         try:
@@ -85,36 +107,23 @@ class Recorder:
             if file is None:
                 file, size = self._open(kind, t_ns), 0
             self._files[kind] = file, size + len(record)
+            self._last_ns = t_ns
             file.write(record)
         except OSError as error:
             self.lost += 1
-            self._fail(error)
+            self._fail(error, t_ns)
         else:
             self.written += 1
             self.error = None
 
     def _open(self, kind: str, t_ns: int) -> BinaryIO:
-        instant = datetime.fromtimestamp(t_ns // 10**9, UTC)
-        path = self._folder / f"{instant:%Y%m%dT%H%M%S}.{t_ns % 10**9 // 1000:06d}Z-{kind}"
-        self._make_room()
-        return path.open("wb", buffering=1 << 16)
+        open_files = {Path(file.name) for file, _ in self._files.values()}
+        make_room(self._folder, NAME, self._file_bytes, self._total_bytes, open_files)
+        return (self._folder / file_name(t_ns, kind)).open("wb", buffering=1 << 16)
 
-    def _make_room(self) -> None:
-        """Remove the oldest files, as long as one more full one could exceed the limit."""
-        open_names = {Path(file.name) for file, _ in self._files.values()}
-        files = sorted(path for path in self._folder.iterdir() if NAME.fullmatch(path.name))
-        sizes = {path: self._file_bytes if path in open_names else path.stat().st_size for path in files}
-        total = sum(sizes.values()) + self._file_bytes
-        for path in files:
-            if total <= self._total_bytes:
-                return
-            if path not in open_names:
-                path.unlink()
-                total -= sizes[path]
-
-    def _fail(self, error: OSError) -> None:
+    def _fail(self, error: OSError, t_ns: int) -> None:
         self.error = error.strerror or str(error)
-        self._pass_over = RETRY_RECORDS
+        self._next_try_ns = t_ns + RETRY_NS
         self._close_files()
 
     def _close_files(self) -> None:
