@@ -1,6 +1,8 @@
 # make demo    fuse a bundled drive, and explain the result (out/demo)
 # make test    lint, types, tests
-# make study   the long studies; make bench the benchmarks
+# make study   the long studies; make bench the benchmarks; make soak an hour of full load, as fast as it goes
+# make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
+# make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
 # make clean   remove what was made
 # All set-up is done as needed, in a virtual environment of its own (.venv). PYTHON chooses the interpreter, 3.11 or later.
 
@@ -11,7 +13,7 @@ READY := $(VENV)/ready
 TYPING := build/typing/fusiond_adapters
 DEMO := fusiond/data/demo
 
-.PHONY: demo test lint study bench demo-data clean
+.PHONY: demo test test-system lint study bench soak demo-data deb install uninstall clean
 
 demo: $(READY)
 	$(BIN)/fusiond demo --out out/demo
@@ -19,20 +21,42 @@ demo: $(READY)
 test: lint
 	$(BIN)/python -m pytest
 
+test-system: $(READY)
+	$(BIN)/python -m tests.system $(if $(HERE),--here)
+
 lint: $(READY) $(TYPING)
 	$(BIN)/ruff check .
 	$(BIN)/python -m mypy
 
 study: $(READY)
 	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m benchmarks.study
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.run
+
+soak: $(READY)
+	$(BIN)/python -m benchmarks.soak
 
 # The bundled drive: the simulator's, packed so that the same scenario gives the same bytes.
 demo-data: $(READY)
 	$(BIN)/fusiond simulate --config configs/simulate-demo.toml --out $(DEMO)
 	gzip -9nf $(DEMO)/drive.tlog $(DEMO)/drive.log $(DEMO)/truth.csv
+
+deb:
+	PYTHON=$(PYTHON) packaging/deb.sh
+
+# With DESTDIR the files are laid out there, and nothing is set up.
+install:
+	PYTHON=$(PYTHON) packaging/stage.sh "$(DESTDIR)"
+	$(if $(DESTDIR),,packaging/postinst configure)
+
+uninstall:
+	packaging/prerm remove
+	rm -rf /opt/fusiond /usr/share/fusiond
+	rm -f /usr/bin/fusiond /usr/lib/systemd/system/fusiond.service /usr/lib/systemd/system/fusiond@.service
+	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf
+	packaging/postrm remove
 
 $(READY): pyproject.toml setup.py fusiond/_kernel.pyx
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'

@@ -1,26 +1,51 @@
-"""The demonstration: fuses a bundled drive, and explains to a newcomer what came out."""
+"""The demonstration: plays a bundled drive into a running daemon, and explains to a newcomer what came out.
+
+The daemon takes it by its live inputs, MAVLink over UDP and a virtual CAN bus, on a clock that may run faster than time.
+What it recorded is then replayed, which gives the states that it published, byte for byte, and the explanation.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import math
+import socket
+import sys
 import textwrap
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+
+import can
+import msgspec
 
 from fusiond import config
 from fusiond.comparison import TruthReport
+from fusiond.daemon import Daemon, punctual_loop
+from fusiond.messages import StateMessage, csv_row
+from fusiond.progress import shown
 from fusiond.replay import Options, OutputError, replay
 from fusiond.report import Stretch, Summary
+from fusiond_adapters.can_bus import CanBus
+from fusiond_adapters.host_clock import HostClock
+from fusiond_adapters.play import PlayedClock, Player
 
 DRIVE = Path(__file__).parent / "data" / "demo"  # made by `make demo-data` from configs/simulate-demo.toml
 LOGS = ("drive.tlog.gz", "drive.log.gz")
-LENGTH_NS = 150_000_000_000  # of the drive, for the progress bar: its logs are too small to tell by their bytes
+LENGTH_NS = 150_000_000_000  # of the drive
+CHANNEL = "fusiond-demo"  # of the virtual CAN bus
+SETTLE_S = 0.5  # nothing more comes from a socket that has been quiet for so long
+OPEN_S = 10.0  # for the inputs to open
+LEAD_NS = 300_000_000  # from the beginning of the clock to that of the drive
+POLL_S = 0.01
 WIDTH = 96  # characters of the explanation
 
 
-def run(out: Path) -> None:
-    """Fuse the bundled drive, write track.csv, summary.json and track.png to a folder, and explain them on stdout.
+def run(out: Path, speed: float) -> None:
+    """Play the bundled drive at `speed` times real time into a daemon, write track.csv, summary.json and track.png to a
+    folder, and explain them on stdout.
 
     Raises OutputError.
     """
@@ -29,19 +54,23 @@ def run(out: Path) -> None:
     except OSError as error:
         raise OutputError(f"{out}: cannot be made: {error.strerror}") from error
     drawing = importlib.util.find_spec("matplotlib") is not None
-    print(_paragraph(INTRODUCTION), flush=True)
-    summary = replay(
-        Options(
-            config=config.load(DRIVE / "fusiond.toml"),
-            config_name="fusiond.toml",
-            logs=[str(DRIVE / log) for log in LOGS],
-            csv=out / "track.csv",
-            json=out / "summary.json",
-            truth=DRIVE / "truth.csv.gz",
-            plot=out / "track.png" if drawing else None,
-            share=lambda elapsed_ns: elapsed_ns / LENGTH_NS,
+    print(_paragraph(INTRODUCTION.format(speed=f"{speed:g}")), flush=True)
+    with TemporaryDirectory(prefix="fusiond-demo-") as box:
+        settings = _settings(box)
+        played = _play(settings, speed)
+        summary = replay(
+            Options(
+                config=settings,
+                config_name="fusiond.toml",
+                logs=[str(path) for path in sorted(Path(box).iterdir())],
+                csv=out / "track.csv",
+                json=out / "summary.json",
+                truth=DRIVE / "truth.csv.gz",
+                plot=out / "track.png" if drawing else None,
+            )
         )
-    )
+    track = (out / "track.csv").read_text(encoding="ascii").splitlines()[1:]
+    print("\nLIVE\n" + _paragraph(_live(played, track)))
     for paragraph in explanation(summary):
         print(f"\n{paragraph}")
     print(f"\nWritten to {out}: track.csv (the track), summary.json (every figure), ", end="")
@@ -51,8 +80,100 @@ def run(out: Path) -> None:
 
 INTRODUCTION = """\
 A car drives through a town for two and a half minutes: bends, a hill, a stop. Its autopilot sends an inertial sensor
-and a GNSS receiver over MAVLink, its wheel speeds come over CAN. The logs were made by fusiond's simulator in the true
-wire formats, so what really happened is known. Fusing them now."""
+and a GNSS receiver over MAVLink, its wheel speeds come over CAN. The drive was made by fusiond's simulator in the true
+wire formats, so what really happened is known. It is now played to a running fusiond, over UDP and a virtual CAN bus,
+up to {speed} times as fast as it happened."""
+
+
+@dataclass
+class Played:
+    """What a daemon made of the drive."""
+
+    rows: list[str]  # every state published, as a row of CSV
+    sent: int  # frames that carry something for it
+    missing: int  # of these, never received
+    dropped: int  # received, but lost in a full queue
+    speed: float  # times real time
+    late_ms: float  # how far the player was behind at the most, in the time of the drive
+    overtaken_ms: float  # how far a frame was overtaken on its way at the most, likewise
+
+
+def _settings(box: str) -> config.Config:
+    """The drive's configuration, with live inputs of this machine and a black box."""
+    settings = config.load(DRIVE / "fusiond.toml")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        connection = f"udpin:127.0.0.1:{probe.getsockname()[1]}"
+    change = msgspec.structs.replace
+    return change(
+        settings,
+        mavlink={name: change(link, connection=connection) for name, link in settings.mavlink.items()},
+        can={name: change(bus, interface="virtual", channel=CHANNEL) for name, bus in settings.can.items()},
+        record=change(settings.record, folder=box),
+    )
+
+
+def _play(settings: config.Config, speed: float) -> Played:
+    """Run a daemon while the drive is played to it. Raises OutputError where its inputs do not open."""
+    states: list[StateMessage] = []
+    port = int(next(iter(settings.mavlink.values())).connection.rpartition(":")[2])
+    with (
+        can.Bus(interface="virtual", channel=CHANNEL) as bus,
+        Player(DRIVE / LOGS[0], DRIVE / LOGS[1], port, bus) as player,
+    ):
+        is_true = speed == 1
+        clock = HostClock(player.begin_ns - LEAD_NS) if is_true else PlayedClock(player.begin_ns, speed)
+        daemon = Daemon(settings, sinks=[states.append], zenoh=False, clock=clock)
+        with asyncio.Runner(loop_factory=punctual_loop) as runner:
+            runner.run(_run_while_played(daemon, player))
+    received = sum(source.inbox.received for source in daemon.inputs.values())
+    wanted = {key for source in daemon.inputs.values() if isinstance(source, CanBus) for key in source.decoder.keys}
+    sent = player.sent_mavlink + sum(count for number, count in player.sent_can.items() if number in wanted)
+    return Played(
+        rows=[csv_row(state) for state in states],
+        sent=sent,
+        missing=sent - received,
+        dropped=sum(source.inbox.dropped for source in daemon.inputs.values()),
+        speed=LENGTH_NS / 1e9 / player.seconds,
+        late_ms=player.late_ns / 1e6,
+        overtaken_ms=daemon.live.most_moved_ns / 1e6,
+    )
+
+
+async def _run_while_played(daemon: Daemon, player: Player) -> None:
+    halt = Event()
+
+    def play() -> None:
+        played = player.play(daemon.clock, lambda: daemon.live.engine.now_ns, halt)
+        for _ in shown(played, lambda: player.since_ns / LENGTH_NS, lambda: player.since_ns, sys.stderr):
+            pass
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(daemon.run())
+        try:
+            async with asyncio.timeout(OPEN_S):
+                while not all(source.counts()["sessions"] for source in daemon.inputs.values()):
+                    await asyncio.sleep(POLL_S)
+            await asyncio.to_thread(play)
+            received = -1
+            while received != (received := sum(source.inbox.received for source in daemon.inputs.values())):
+                await asyncio.sleep(SETTLE_S)
+        except TimeoutError as error:
+            raise OutputError("the demonstration's own inputs do not open") from error
+        finally:
+            halt.set()
+            daemon.stop()
+
+
+def _live(played: Played, track: list[str]) -> str:
+    """What is to be told of the live run; `track` is the replay's."""
+    same = sum(ours == theirs for ours, theirs in zip(played.rows, track, strict=False))
+    return (
+        f"The drive took {LENGTH_NS / 1e9 / played.speed:.0f} s: this machine managed {played.speed:.1f} times real time."
+        f" {played.sent} frames were sent, {played.missing} of them lost on their way, {played.dropped} in full queues;"
+        f" they were up to {played.late_ms:.0f} ms late, and held up by each other for up to {played.overtaken_ms:.0f} ms."
+        f" {len(played.rows)} states were published. The recording, replayed, gives {same} of {len(track)} alike."
+    )
 
 
 def explanation(summary: Summary) -> Iterator[str]:

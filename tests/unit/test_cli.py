@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -179,6 +180,9 @@ def test_demo(run: Run, tmp_path: Path) -> None:
     code, out, _ = run("demo", "--out", tmp_path / "out" / "demo")
     assert code == SUCCESS
     assert "WITH BAD GNSS" in out
+    told = " ".join(out.split())
+    assert re.search(r"replayed, gives (\d+) of \1 alike", told)
+    assert ", 0 of them lost on their way, 0 in full queues" in told
     written = {path.name for path in (tmp_path / "out" / "demo").iterdir()}
     assert written == {"track.csv", "summary.json", "track.png"}
 

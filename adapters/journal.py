@@ -1,0 +1,136 @@
+"""What is logged: under systemd in the journal's own protocol, with fields; else as lines on stderr.
+
+A record's `extra` gives fields: FUSIOND_SOURCE (the input or output that it is about), FUSIOND_MODE, MESSAGE_ID (the
+kind of event, for `journalctl MESSAGE_ID=...`). What is said again and again is counted instead, and the count told
+with the next one that is said after REPEAT_S.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from typing import TextIO
+
+ADDRESS = "/run/systemd/journal/socket"
+PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))  # syslog's
+REPEAT_S = 30.0  # within this the same is not said twice
+MOST_KEPT = 256  # different messages that are remembered
+
+# MESSAGE_ID by kind of event
+EVENTS = {
+    "mode": "e13b1fe73096462ca7b80a47ff78f898",
+    "reset": "22f152c7f51b46968d1a8e72211a769b",
+    "source_lost": "d38d920ccaeb4f778624c5c13553fe82",
+    "source_found": "91ee207d6dee4087af9ffdefed58eb49",
+    "source_status": "c3ad48b0445f410481aeb313d68164ad",
+}
+CONNECTION_LOST = "6f76bece9cb8432588f2d5f2b9136fed"
+DATA_LOST = "f9c7bf04bb324984934cfddb280196f7"
+STARTED = "6bc34b7cdb044fa78ef50a5cadc4df05"
+ENDED = "4d7cc2b0c67c45528deb303a00413de1"
+RELOADED = "65be903f1e374e55a4416688a46ade1f"
+
+
+def about(kind: str, subject: str) -> dict[str, str]:
+    """The fields of a published event: its subject is the mode entered, or a source."""
+    named = {"FUSIOND_MODE": subject} if kind == "mode" else {"FUSIOND_SOURCE": subject} if subject else {}
+    return {"MESSAGE_ID": EVENTS[kind], **named} if kind in EVENTS else named
+
+
+class Repeats(logging.Filter):
+    """Lets the first of equal records pass, counts those within REPEAT_S after it, tells their number with the next."""
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._now = now
+        self._said: dict[tuple[int, str], tuple[float, int]] = {}  # level and text: when it was said, repeats since
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether to say it. An event that is no warning always is: it tells how things stand."""
+        if record.levelno < logging.WARNING and hasattr(record, "MESSAGE_ID"):
+            return True
+        key = record.levelno, record.getMessage()
+        now = self._now()
+        said, count = self._said.get(key, (None, 0))
+        if said is not None and now - said < REPEAT_S:
+            self._said[key] = said, count + 1
+            return False
+        self._said.pop(key, None)
+        self._said[key] = now, 0
+        if len(self._said) > MOST_KEPT:
+            del self._said[next(iter(self._said))]
+        if said is not None and count:
+            record.msg, record.args = f"{key[1]} ({count} times more in the {now - said:.0f} s before)", ()
+        return True
+
+
+class JournalHandler(logging.Handler):
+    """Sends records to the journal, a datagram each. What the journal does not take is counted in `lost`."""
+
+    def __init__(self, address: str = ADDRESS) -> None:
+        super().__init__()
+        self.lost = 0
+        self._address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)  # a busy journal must not hold up the estimator
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record."""
+        try:
+            self._socket.sendto(b"".join(_field(name, value) for name, value in fields(record)), self._address)
+        except OSError:
+            self.lost += 1
+
+    def close(self) -> None:
+        """Send no more."""
+        self._socket.close()
+        super().close()
+
+
+def fields(record: logging.LogRecord) -> Iterator[tuple[str, str]]:
+    """The journal's fields of a record."""
+    text = record.getMessage()
+    if record.exc_info:
+        text += "\n" + "".join(traceback.format_exception(*record.exc_info)).rstrip()
+    yield "MESSAGE", text
+    yield "PRIORITY", str(next(priority for level, priority in PRIORITIES if record.levelno >= level))
+    yield "SYSLOG_IDENTIFIER", "fusiond"
+    yield "LOGGER", record.name
+    yield "CODE_FILE", record.pathname
+    yield "CODE_LINE", str(record.lineno)
+    yield "CODE_FUNC", record.funcName or "?"
+    yield "THREAD_NAME", record.threadName or "?"
+    for name, value in vars(record).items():
+        if name.startswith("FUSIOND_") or name == "MESSAGE_ID":
+            yield name, str(value)
+
+
+def _field(name: str, value: str) -> bytes:
+    """As the native protocol has it: a line, or, where the value has several, its length and then itself."""
+    data = value.encode("utf-8", "backslashreplace")
+    if b"\n" not in data:
+        return name.encode() + b"=" + data + b"\n"
+    return name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n"
+
+
+def is_journal(stream: TextIO) -> bool:
+    """Whether a stream goes to the journal: $JOURNAL_STREAM names its device and inode."""
+    try:
+        status = os.fstat(stream.fileno())
+    except OSError:
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+def set_up(level: int = logging.INFO) -> None:
+    """Send all that is logged to the journal, where stderr goes there, else to stderr."""
+    handler: logging.Handler = JournalHandler() if is_journal(sys.stderr) else logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+    handler.addFilter(Repeats())
+    logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # what python-can has to say of a bus that is away is raised as well

@@ -1,0 +1,210 @@
+"""Whether fusiond keeps its memory and loses count of nothing, under full load for a long time; and whether the replay of
+what it recorded publishes the same bytes.
+
+    python -m benchmarks.soak [--minutes 60] [--real-time] [--out out/soak]
+
+The load is that of benchmarks.latency. Accelerated, frames go into the inboxes with stamps of a simulated clock, as fast
+as they are taken; in real time they come over UDP and a virtual CAN bus. The exit status is 1 where something is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import hashlib
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import BinaryIO
+
+import msgspec
+from pymavlink.dialects.v20 import common
+
+from benchmarks.latency import CAN_HZ, GNSS_HZ, GNSS_LATE_US, IMU_HZ, configuration, free_port, process, turn_wheels
+from fusiond.config import Config
+from fusiond.daemon import Daemon, punctual_loop
+from fusiond.messages import StateMessage, encode
+from fusiond.replay import Replay, Wants
+from fusiond_adapters.can_bus import CanFrame
+from fusiond_adapters.logs.merge import open_logs
+from fusiond_adapters.play import PlayedClock
+
+SECOND = 1_000_000_000  # ns
+BEGIN_NS = 1_760_000_000 * SECOND
+SETTLED_S = 300.0  # memory is flat from here on
+FLAT_MB = 2.0
+DIGEST = 8  # bytes of a publication's digest
+LOOKS = 20  # at the memory
+
+
+def rss_mb() -> float:
+    """Memory of this process now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+class Published:
+    """Digests of everything published, in a file: a list would be the growth that is looked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.count = 0
+        self._file = file
+
+    def add(self, message: StateMessage) -> None:
+        """From the estimator."""
+        self.count += 1
+        self._file.write(digest(message))
+
+
+def digest(message: StateMessage) -> bytes:
+    return hashlib.blake2b(encode(message, "json"), digest_size=DIGEST).digest()
+
+
+class Memory:
+    """Looks at the memory as the run goes on."""
+
+    def __init__(self, seconds: float) -> None:
+        self.settled_mb: float | None = None
+        self._settled_s, self._every = min(SETTLED_S, seconds / 2), seconds / LOOKS
+        self._next = 0.0
+
+    def look(self, elapsed_s: float) -> None:
+        """To be called often."""
+        if self.settled_mb is None and elapsed_s >= self._settled_s:
+            self.settled_mb = rss_mb()
+        if elapsed_s >= self._next:
+            self._next += self._every
+            print(f"{elapsed_s:6.0f} s  {rss_mb():7.2f} MB", flush=True)
+
+    def growth_mb(self) -> float:
+        """Since it settled."""
+        assert self.settled_mb is not None
+        return rss_mb() - self.settled_mb
+
+
+def frames(seconds: float) -> Iterator[tuple[int, bytes | CanFrame]]:
+    """Instant [ns from the start] and frame: what benchmarks.latency sends, from a vehicle at rest."""
+    link = common.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def packed(message: common.MAVLink_message) -> bytes:
+        frame = bytes(message.pack(link))
+        link.seq = (link.seq + 1) & 0xFF
+        return frame
+
+    for number in range(round(IMU_HZ * seconds)):
+        t_ns = number * SECOND // IMU_HZ
+        us = t_ns // 1000 + 60_000_000  # since boot
+        wobble = 0.01 * (number % 7 - 3)
+        rest = (*(0.0,) * 7, 0x3F, 0)
+        yield t_ns, packed(common.MAVLink_highres_imu_message(us, wobble, 0.0, -9.81, 1e-4, wobble / 10, 0.0, *rest))
+        if number % (IMU_HZ // CAN_HZ) == 0:
+            yield t_ns + 200_000, CanFrame(256, False, bytes(8))
+        if number % (IMU_HZ // GNSS_HZ) == 0:
+            yield t_ns + 400_000, packed(common.MAVLink_gps_raw_int_message(
+                us - GNSS_LATE_US, 3, 481374300, 115754900, 563000, 80, 120, 0, 0, 14, 563000, 500, 800, 50))  # fmt: skip
+        if number % IMU_HZ == 0:
+            kind, maker = common.MAV_TYPE_GROUND_ROVER, common.MAV_AUTOPILOT_GENERIC
+            yield t_ns + 600_000, packed(common.MAVLink_heartbeat_message(kind, maker, 0, 0, common.MAV_STATE_ACTIVE, 3))
+
+
+def accelerated(settings: Config, seconds: float, published: Published, memory: Memory, box: Path) -> Daemon:
+    """As fast as it goes, on a simulated clock."""
+    clock = PlayedClock(BEGIN_NS, 1.0)
+    daemon = Daemon(settings, sinks=[published.add], zenoh=False, clock=clock)
+    link, bus = daemon.inputs["mavlink.fc"], daemon.inputs["can.car"]
+    with ExitStack() as stack:
+        files: dict[str, BinaryIO] = {}
+
+        def record(kind: str, _t_ns: int, data: bytes) -> None:
+            if kind not in files:
+                files[kind] = stack.enter_context((box / kind).open("wb"))
+            files[kind].write(data)
+
+        daemon.live.record = record
+        for since_ns, frame in frames(seconds):
+            clock.set(BEGIN_NS + since_ns)
+            (bus if isinstance(frame, CanFrame) else link).inbox.put(clock.now_ns(), frame)
+            daemon.live.step(daemon.inputs)
+            memory.look(since_ns / SECOND)
+    return daemon
+
+
+async def in_real_time(settings: Config, seconds: float, published: Published, memory: Memory) -> Daemon:
+    """Over the live inputs."""
+    daemon = Daemon(settings, sinks=[published.add])
+    run = asyncio.create_task(daemon.run())
+    await daemon.up.wait()
+    port = settings.mavlink["fc"].connection.rpartition(":")[2]
+    wheels = threading.Thread(target=turn_wheels, args=(seconds,), name="(the benchmark's wheels)")
+    began = time.monotonic()
+    with process("--feed", port, "--seconds", seconds):
+        wheels.start()
+        while (elapsed_s := time.monotonic() - began) < seconds:
+            memory.look(elapsed_s)
+            await asyncio.sleep(1.0)
+    await asyncio.to_thread(wheels.join)
+    daemon.stop()
+    await run
+    return daemon
+
+
+def replayed(settings: Config, box: Path, digests: Path) -> tuple[int, int]:
+    """States that a replay of the recording publishes, and how many of them are not what was published live."""
+    count = other = 0
+    with digests.open("rb") as file:
+
+        def compare(message: StateMessage, _: object) -> None:
+            nonlocal count, other
+            count += 1
+            other += file.read(DIGEST) != digest(message)
+
+        logs = [str(path) for path in sorted(box.iterdir())]
+        Replay(settings, Wants(settings.publish.rate_hz, on_tick=[compare])).run(open_logs(logs, settings))
+    return count, other
+
+
+def soak(seconds: float, out: Path, *, real_time: bool) -> bool:
+    """Run, tell what was found, and whether it is as it should be."""
+    settings = configuration(out, free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM))
+    memory, digests = Memory(seconds), out / "digests"
+    with TemporaryDirectory(dir=out) as box:
+        with digests.open("wb") as file:
+            published = Published(file)
+            begin = time.monotonic()
+            if real_time:
+                record = msgspec.structs.replace(settings.record, folder=box)
+                settings = msgspec.structs.replace(settings, record=record)
+                with asyncio.Runner(loop_factory=punctual_loop) as runner:
+                    daemon = runner.run(in_real_time(settings, seconds, published, memory))
+            else:
+                daemon = accelerated(settings, seconds, published, memory, Path(box))
+        growth_mb = memory.growth_mb()
+        took_s = time.monotonic() - begin
+        print(f"{seconds:.0f} s of load in {took_s:.0f} s")
+        print(f"memory settled at {memory.settled_mb:.2f} MB, then {growth_mb:+.2f} MB")
+        totals = daemon.live.engine.fusion.totals()
+        accounted = sum(totals.values()) == daemon.live.offered
+        print(f"measurements: {daemon.live.offered} offered, {sum(totals.values())} accounted for: {totals}")
+        print(f"lost: {daemon.losses()}")
+        count, other = replayed(settings, Path(box), digests)
+    print(f"states: {published.count} published, {count} replayed, {other} of them not the same bytes")
+    return growth_mb <= FLAT_MB and accounted and count > 0 and not other
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--real-time", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("out/soak"))
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    return 0 if soak(60 * options.minutes, options.out, real_time=options.real_time) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,24 @@
+#!/usr/bin/env bash
+# Makes dist/fusiond_VERSION_ARCHITECTURE.deb, for systems whose /usr/bin/python3 is of the version that PYTHON has here.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=${PYTHON:-python3}
+root=$PWD/build/deb
+rm -rf "$root"
+packaging/stage.sh "$root"
+
+# The target's own interpreter in place of this machine's.
+read -r minor next < <("$python" -c 'import sys; print(f"3.{sys.version_info[1]} 3.{sys.version_info[1] + 1}")')
+ln -sfn /usr/bin/python3 "$root/opt/fusiond/bin/python3"
+ln -sfn python3 "$root/opt/fusiond/bin/python"
+ln -sfn python3 "$root/opt/fusiond/bin/python$minor"
+sed -i "s|^home = .*|home = /usr/bin|; /^executable = /d; /^command = /d" "$root/opt/fusiond/pyvenv.cfg"
+
+version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' fusiond/__init__.py)
+architecture=$(dpkg --print-architecture)
+mkdir -p "$root/DEBIAN" dist
+sed "s|@VERSION@|$version|; s|@ARCHITECTURE@|$architecture|; s|@PYTHON@|$minor|; s|@NEXT@|$next|;
+     s|@SIZE@|$(du -sk "$root/opt" | cut -f1)|" packaging/control > "$root/DEBIAN/control"
+install -m755 -t "$root/DEBIAN" packaging/postinst packaging/prerm packaging/postrm
+chmod -R go-w "$root"
+dpkg-deb --root-owner-group -Zgzip -z6 --build "$root" "dist/fusiond_${version}_$architecture.deb"
