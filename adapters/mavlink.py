@@ -13,31 +13,38 @@ heartbeats can be read and nothing of the first second is lost. Ground stations,
 from __future__ import annotations
 
 import importlib
-import math
 import pkgutil
 import re
 from collections.abc import Callable
 from operator import itemgetter
-from struct import Struct
+from struct import Struct, calcsize
 from typing import Any
 
 import pymavlink.dialects.v20 as dialects
 from fastcrc.crc16 import mcrf4xx
 
-from fusiond.config import Config, Gnss, Imu
+from fusiond.config import Config
 from fusiond.measurements import (
+    HOST_CLOCK,
     UNIX_CLOCK,
     AnyPayload,
     ClockPair,
-    GnssPosition,
-    GnssVelocity,
-    ImuSample,
-    Invalid,
     Received,
-    Vector3,
     boot_clock,
 )
 from fusiond.toml_file import ConfigError
+
+from .mavlink_sensors import (
+    GNSS_FIELDS,
+    PRESSURE_FIELDS,
+    WHEEL_DISTANCE,
+    WHEEL_FIELDS,
+    GnssHandler,
+    ImuHandler,
+    PressureHandler,
+    WheelHandler,
+    imu_fields,
+)
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 MAGIC = re.compile(b"[\xfd\xfe]")
@@ -50,15 +57,15 @@ LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 
 HEARTBEAT = "HEARTBEAT"
 SYSTEM_TIME = "SYSTEM_TIME"
+TIMESYNC = "TIMESYNC"
+NO_SENSORS = (HEARTBEAT, SYSTEM_TIME, TIMESYNC)
+TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: a question of fusiond's is stamped in whole microseconds and so much
 TYPE_GROUND_STATION = 6  # MAV_TYPE_GCS
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 
 UNIX_FROM_US = 10**15  # a stamp beyond this is Unix time (from 2001-09), below it counts from boot
 UNIX_UNTIL_US = 4_102_444_800 * 10**6  # 2100: beyond this it is garbage
 CLOCK_SET_US = 1_262_304_000 * 10**6  # 2010: an autopilot that says less has not set its clock
-MILLI_G = 9.80665e-3  # m/s^2
-UNKNOWN_U16 = 65535
-ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 LONGEST_GAP = 128  # a longer jump of the frame counter is a repeat or a reordering, not a loss
 
 Bytes = bytes | bytearray
@@ -166,29 +173,51 @@ class FrameSplitter:
 
 
 class _Reader:
-    """One wanted message: its layout, and the functions that make events of its fields."""
+    """One wanted message: its layout, and the functions that make events of its fields. Only the fields asked for are
+    unpacked; one that is an array gives as many values."""
 
     def __init__(self, kind: Any, fields: tuple[str, ...]) -> None:
-        self._unpack: Callable[[bytes], tuple[Any, ...]] = kind.unpacker.unpack
-        self._size: int = kind.unpacker.size
+        layout = _layout(kind, fields)
+        self._unpack: Callable[[bytes], tuple[Any, ...]] = layout.unpack
+        self._size = layout.size
+        self._pick = _order(kind, fields)
         self.seed = _seed(kind)
-        self._pick = itemgetter(*(kind.ordered_fieldnames.index(name) for name in fields))
-        self.is_sensor = kind.msgname not in (HEARTBEAT, SYSTEM_TIME)
+        self.is_sensor = kind.msgname not in NO_SENSORS
         self.handlers: list[Callable[[tuple[Any, ...], int], list[Received]]] = []
 
     def fields(self, frame: bytes) -> tuple[Any, ...]:
         """The fields asked for, of a frame whose checksum is right."""
-        start = HEADER_2 if frame[0] == MAGIC_2 else HEADER_1
-        payload = frame[start : start + min(frame[1], self._size)]
-        picked: tuple[Any, ...] = self._pick(self._unpack(payload.ljust(self._size, b"\0")))
-        return picked
+        start, size = HEADER_2 if frame[0] == MAGIC_2 else HEADER_1, self._size
+        present = frame[1]
+        payload = frame[start : start + (present if present < size else size)]
+        fields = self._unpack(payload.ljust(size, b"\0"))
+        return fields if self._pick is None else self._pick(fields)
 
 
-_AXES = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro")
-_IMU_STAMP = {"HIGHRES_IMU": "time_usec", "RAW_IMU": "time_usec"}
-_IMU_EXTRA = {"HIGHRES_IMU": ("fields_updated", "id")}
-_GNSS_BASE = ("time_usec", "fix_type", "lat", "lon", "alt", "vel", "cog")
-_GNSS_EXTENSIONS = ("alt_ellipsoid", "h_acc", "v_acc", "vel_acc")
+def _codes(kind: Any) -> dict[str, str]:
+    """The struct code of each field of a message, in the order of the wire."""
+    return dict(zip(kind.ordered_fieldnames, re.findall(r"\d*[a-zA-Z]", kind.unpacker.format), strict=True))
+
+
+def _layout(kind: Any, fields: tuple[str, ...]) -> Struct:
+    """What unpacks those fields alone, in the order of the wire, up to the last of them."""
+    codes = _codes(kind)
+    last = max(map(kind.ordered_fieldnames.index, fields))
+    parts = (code if name in fields else f"{calcsize('<' + code)}x" for name, code in list(codes.items())[: last + 1])
+    return Struct("<" + "".join(parts))
+
+
+def _order(kind: Any, fields: tuple[str, ...]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]] | None:
+    """What puts the values of `_layout` into the order of `fields`; None where they have it."""
+    places: dict[str, list[int]] = {}
+    count = 0
+    for name, code in _codes(kind).items():
+        if name in fields:
+            values = 1 if code.endswith("s") else int(code[:-1] or 1)
+            places[name] = list(range(count, count + values))
+            count += values
+    order = [place for name in fields for place in places[name]]
+    return None if order == list(range(count)) else itemgetter(*order)
 
 
 class MavlinkDecoder:
@@ -209,49 +238,56 @@ class MavlinkDecoder:
         except ConfigError as error:
             raise ConfigError(f"mavlink.{link}.dialect: {error}") from error
         self._component = settings.component
+        self._autopilot = settings.component  # component that answers TIMESYNC; 0: not heard yet
+        self._sender = 0  # component of the frame at hand
         self._boot_clock = boot_clock(link, self.system)
         self._sequences = {} if sequences is None else sequences
-        self._last_counter: dict[int, int] = {}
+        self._next_counter: dict[int, int] = {}  # by component
         kinds = ("decoded", "skipped", "other systems", "other components", "other instances")
         self.counts = dict.fromkeys((*kinds, "bad checksum", "undecodable", "lost"), 0)
 
     def decode(self, frame: bytes, t_receive_ns: int) -> list[Received]:
         """The events in one complete frame; none where the frame is not wanted or not sound (see `counts`)."""
-        reader = self._admit(frame)
-        if isinstance(reader, str):
-            self.counts[reader] += 1
+        if len(frame) < HEADER_1 + CHECKSUM or frame_length(frame) != len(frame):
+            self.counts["undecodable"] += 1
+            return []
+        if frame[0] == MAGIC_2:
+            counter, system, component, low, high = SENDER_2.unpack_from(frame, 4)
+            return self.take(low | high << 16, counter, system, component, frame, t_receive_ns)
+        counter, system, component, number = SENDER_1.unpack_from(frame, 2)
+        return self.take(number, counter, system, component, frame, t_receive_ns)
+
+    def take(
+        self, number: int, counter: int, system: int, component: int, frame: bytes, t_receive_ns: int
+    ) -> list[Received]:
+        """The same, of a frame whose length is right and whose header says that: message id, frame counter, sender."""
+        reader = self._readers.get(number)
+        if self._component and component != self._component:
+            self.counts["other components"] += 1
+            return []
+        if system != self.system and not (reader is not None and self._adopt(system, reader, frame)):
+            self.counts["other systems"] += 1
+            return []
+        if reader is not None and not is_sound(frame, reader.seed):
+            self.counts["bad checksum"] += 1
+            return []
+        expected = self._next_counter.get(component, counter)
+        self._next_counter[component] = counter + 1 & 0xFF
+        if counter != expected and (counter - expected) & 0xFF < LONGEST_GAP:
+            self.counts["lost"] += (counter - expected) & 0xFF
+        if reader is None:
+            self.counts["skipped"] += 1
             return []
         self.counts["decoded"] += 1
+        self._sender = component
         fields = reader.fields(frame)
         if len(reader.handlers) == 1:
             return reader.handlers[0](fields, t_receive_ns)
         return [event for handle in reader.handlers for event in handle(fields, t_receive_ns)]
 
-    def _admit(self, frame: bytes) -> _Reader | str:
-        """Who reads this frame, or else the name of the count it belongs to."""
-        if len(frame) < HEADER_1 + CHECKSUM or frame_length(frame) != len(frame):
-            return "undecodable"
-        if frame[0] == MAGIC_2:
-            counter, system, component, low, high = SENDER_2.unpack_from(frame, 4)
-            number = low | high << 16
-        else:
-            counter, system, component, number = SENDER_1.unpack_from(frame, 2)
-        if self._component not in (0, component):
-            return "other components"
-        reader = self._readers.get(number)
-        if system != self.system and not self._adopt(system, reader, frame):
-            return "other systems"
-        if reader is not None and not is_sound(frame, reader.seed):
-            return "bad checksum"
-        missing = (counter - self._last_counter.get(component, counter - 1) - 1) & 0xFF
-        self._last_counter[component] = counter
-        if 0 < missing < LONGEST_GAP:
-            self.counts["lost"] += missing
-        return "skipped" if reader is None else reader
-
-    def _adopt(self, system: int, reader: _Reader | None, frame: bytes) -> bool:
+    def _adopt(self, system: int, reader: _Reader, frame: bytes) -> bool:
         """Does this frame of a system not followed so far make it the one to follow?"""
-        if self.settled or reader is None or system == 0 or not self.dialect.sound(frame):
+        if self.settled or system == 0 or not self.dialect.sound(frame):
             return False
         if reader is self._heartbeat:
             if not _is_autopilot(reader.fields(frame)):
@@ -260,7 +296,7 @@ class MavlinkDecoder:
             return False
         self.system = system
         self._boot_clock = boot_clock(self.link, system)
-        self._last_counter.clear()
+        self._next_counter.clear()
         return True
 
     def _make_readers(self, config: Config) -> dict[int, _Reader]:
@@ -274,18 +310,34 @@ class MavlinkDecoder:
         self._heartbeat.handlers.append(self._take_heartbeat)
         if SYSTEM_TIME in self.dialect.ids:
             reader(SYSTEM_TIME, ("time_unix_usec", "time_boot_ms")).handlers.append(self._take_system_time)
+        if TIMESYNC in self.dialect.ids:
+            reader(TIMESYNC, ("tc1", "ts1")).handlers.append(self._take_timesync)
         for name, imu in config.imu.items():
             if imu.link == self.link:
-                fields = (_IMU_STAMP.get(imu.message, "time_boot_ms"), *_AXES, *_IMU_EXTRA.get(imu.message, ()))
-                reader(imu.message, fields).handlers.append(_ImuHandler(self, name, imu).take)
+                reader(imu.message, imu_fields(imu.message)).handlers.append(ImuHandler(self, name, imu).take)
         for name, gnss in config.gnss.items():
             if gnss.link == self.link:
-                reader(gnss.message, _GNSS_BASE + _GNSS_EXTENSIONS).handlers.append(_GnssHandler(self, name, gnss).take)
+                reader(gnss.message, GNSS_FIELDS).handlers.append(GnssHandler(self, name, gnss).take)
+        for name, wheel in config.wheel.items():
+            if wheel.link == self.link:
+                reader(WHEEL_DISTANCE, WHEEL_FIELDS).handlers.append(WheelHandler(self, name, wheel, config).take)
+        for name, barometer in config.barometer.items():
+            if barometer.link == self.link:
+                reader(barometer.message, PRESSURE_FIELDS).handlers.append(PressureHandler(self, name, barometer).take)
         return readers
 
     def _take_heartbeat(self, fields: tuple[int, int], _t_receive_ns: int) -> list[Received]:
-        self.settled = self.settled or _is_autopilot(fields)
+        if _is_autopilot(fields):
+            self.settled, self._autopilot = True, self._autopilot or self._sender
         return []
+
+    def _take_timesync(self, fields: tuple[int, int], t_receive_ns: int) -> list[Received]:
+        """The autopilot's answer to a question of ours, told by its mark; all it needs to be read is in the frame."""
+        remote_ns, asked_ns = fields
+        if remote_ns <= 0 or self._sender != self._autopilot or asked_ns % TIMESYNC_STEP != TIMESYNC_MARK:
+            return []
+        stamp = (self._boot_clock, remote_ns)
+        return [self.event(f"{self.link}.timesync", stamp, t_receive_ns, ClockPair(HOST_CLOCK, asked_ns))]
 
     def _take_system_time(self, fields: tuple[int, int], t_receive_ns: int) -> list[Received]:
         unix_us, boot_ms = fields
@@ -312,94 +364,3 @@ class MavlinkDecoder:
 def _is_autopilot(heartbeat: tuple[Any, ...]) -> bool:
     vehicle, autopilot = heartbeat
     return bool(vehicle != TYPE_GROUND_STATION and autopilot != NO_AUTOPILOT)
-
-
-class _ImuHandler:
-    """One [imu.NAME]: fields to ImuSample."""
-
-    def __init__(self, decoder: MavlinkDecoder, name: str, imu: Imu) -> None:
-        self._decoder, self._name, self._imu = decoder, name, imu
-        self._mat_bs = _rotation(imu.rotation_deg) if any(imu.rotation_deg) else None  # sensor axes to body
-        self._si = imu.message == "HIGHRES_IMU"
-        self._stamp_us = 1 if imu.message in _IMU_STAMP else 1000  # microseconds in a unit of the stamp
-
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
-        decoder = self._decoder
-        if self._si and fields[8] != self._imu.instance:
-            decoder.counts["other instances"] += 1
-            return []
-        payload = self._payload(fields)
-        return [decoder.event(self._name, decoder.stamp(fields[0] * self._stamp_us), t_receive_ns, payload)]
-
-    def _payload(self, fields: tuple[Any, ...]) -> ImuSample | Invalid:
-        force, rate = fields[1:4], fields[4:7]
-        if not self._si:
-            force = (force[0] * MILLI_G, force[1] * MILLI_G, force[2] * MILLI_G)
-            rate = (rate[0] / 1e3, rate[1] / 1e3, rate[2] / 1e3)
-        elif fields[7] & ACCEL_AND_GYRO != ACCEL_AND_GYRO:
-            return Invalid("not updated")
-        calm, slow = _within(force, self._imu.accel_limit), _within(rate, self._imu.gyro_limit)
-        if not (calm and slow):
-            finite = math.isfinite(sum(force) + sum(rate))
-            return Invalid(("beyond gyro_limit" if calm else "beyond accel_limit") if finite else "not finite")
-        if self._mat_bs is None:
-            return ImuSample(force, rate)
-        return ImuSample(_turn(self._mat_bs, force), _turn(self._mat_bs, rate))
-
-
-class _GnssHandler:
-    """One [gnss.NAME]: fields to GnssPosition and GnssVelocity."""
-
-    def __init__(self, decoder: MavlinkDecoder, name: str, gnss: Gnss) -> None:
-        self._decoder, self._gnss = decoder, gnss
-        self._position, self._velocity = f"{name}.position", f"{name}.velocity"
-
-    def take(self, fields: tuple[int, ...], t_receive_ns: int) -> list[Received]:
-        time_us, fix_type, lat, lon, alt, vel, cog, alt_ellipsoid, h_acc, v_acc, vel_acc = fields
-        position: AnyPayload
-        velocity: AnyPayload
-        if fix_type < self._gnss.minimum_fix_type:
-            position = velocity = Invalid("no fix")
-        elif lat == 0 and lon == 0:
-            position = velocity = Invalid("no position")
-        elif abs(lat) > 900_000_000 or abs(lon) > 1_800_000_000:
-            position = velocity = Invalid("not on earth")
-        else:
-            height = (alt_ellipsoid or alt) / 1e3
-            latitude, longitude = math.radians(lat / 1e7), math.radians(lon / 1e7)
-            position = GnssPosition(latitude, longitude, height, _known(h_acc), _known(v_acc))
-            speed, course = vel / 1e2, math.radians(cog / 1e2)
-            velocity = GnssVelocity(speed * math.cos(course), speed * math.sin(course), None, _known(vel_acc))
-        decoder = self._decoder
-        stamp = decoder.stamp(time_us) if self._gnss.stamp == "sensor" else ("", None)
-        events = [decoder.event(self._position, stamp, t_receive_ns, position)]
-        if self._gnss.use_velocity and UNKNOWN_U16 not in (vel, cog):
-            events.append(decoder.event(self._velocity, stamp, t_receive_ns, velocity))
-        return events
-
-
-def _known(thousandths: int) -> float | None:
-    """An accuracy of the extension fields, mm or mm/s: 0 is unknown."""
-    return thousandths / 1e3 if thousandths else None
-
-
-def _within(vector: Vector3, limit: float) -> bool:
-    """Is every component finite, and at most `limit` in size?"""
-    x, y, z = vector
-    return -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit
-
-
-def _rotation(angles_deg: Vector3) -> tuple[Vector3, Vector3, Vector3]:
-    """Rows of Rz(yaw) Ry(pitch) Rx(roll): it takes a vector in the sensor's axes to the body's."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in map(math.radians, angles_deg))
-    return (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-
-
-def _turn(rows: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
-    x, y, z = vector
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z

@@ -2,7 +2,8 @@
 
     python -m benchmarks.run [--minutes M] [--repeats N] [--out FOLDER]
 
-The log is simulated once for the given length (default 60 minutes, seed in the output) and kept in the folder.
+All times are CPU time of the process, so that other work on the machine disturbs them little. The log is simulated once
+for the given length (default 60 minutes, seed in the output) and kept in the folder.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,25 +37,30 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 T0 = 1_700_000_000 * SECOND
 FORCE_B, RATE_B = np.array([0.1, 0.2, -9.8]), np.array([0.001, 0.002, 0.003])
 LATITUDE, LONGITUDE, HEIGHT = 0.84, 0.2, 500.0  # rad, rad, m: where the vehicle of the rewinds stands
-COURSE_MINUTES = 2.5  # one round of the simulated course
-COURSE = [  # duration [s], speed at its end [m/s], turn [deg]
+SHORTEST_S = 5.0  # of a simulated drive
+COURSE = [  # one round of the simulated course: duration [s], speed at its end [m/s], turn [deg]
     (10, 0, 0), (10, 12, 0), (15, 12, 90), (20, 18, 0), (20, 18, -90),
     (15, 9, 60), (10, 0, 0), (10, 0, 0), (20, 15, 0), (20, 0, -60),
 ]  # fmt: skip
 
-TELL_PEAK = """
+TELL_USAGE = """
 import atexit, resource
-atexit.register(lambda: print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+def tell():
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    print("USED", used.ru_utime + used.ru_stime, used.ru_maxrss)
+atexit.register(tell)
 """
-MAVLINK_ONLY = """
+READ_MAVLINK = """
 import os, sys
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 log = mavutil.mavlink_connection(sys.argv[1], dialect="common")
 while log.recv_msg() is not None:
     pass
-import can
-for message in can.LogReader(sys.argv[2]):
+"""
+READ_CAN = """
+import can, sys
+for message in can.LogReader(sys.argv[1]):
     pass
 """
 
@@ -67,13 +74,13 @@ class Line(NamedTuple):
 
 
 def median_us(function: Callable[[], object], repeats: int, number: int) -> float:
-    """Median over `repeats` of the mean time [us] of `number` calls."""
+    """Median over `repeats` of the mean CPU time [us] of `number` calls."""
     times = []
     for _ in range(repeats):
-        begin = time.perf_counter_ns()
+        begin = time.process_time_ns()
         for _ in range(number):
             function()
-        times.append((time.perf_counter_ns() - begin) / number / 1000)
+        times.append((time.process_time_ns() - begin) / number / 1000)
     return statistics.median(times)
 
 
@@ -179,9 +186,9 @@ def rewind_lines(unit: float, repeats: int) -> list[Line]:
                 fusion, now = running(imu_hz, 3.0, horizon_s=1.0)
                 for i in range(5):  # a few at one instant: each is an event more for those after it
                     late = event(now - late_ms * 1_000_000 + i, "gps0.position", 10**6 + i)
-                    before, begin = fusion.history.rerun, time.perf_counter_ns()
+                    before, begin = fusion.history.rerun, time.process_time_ns()
                     fusion.take(late)
-                    times.append((time.perf_counter_ns() - begin) / 1000)
+                    times.append((time.process_time_ns() - begin) / 1000)
                     rows.append(fusion.history.rerun - before)
             cost, events = statistics.median(times), statistics.median(rows)
             wanted = "<= 100 x" if (imu_hz, late_ms) == (200, 200) else ""
@@ -205,17 +212,22 @@ def rewind_lines(unit: float, repeats: int) -> list[Line]:
 
 
 def make_log(minutes: float, folder: Path) -> Path:
-    """A simulated drive of that length: IMU 200 Hz, one CAN frame with four wheels at 100 Hz among the frames of a bus,
-    GNSS 10 Hz, 120 ms late."""
+    """A simulated drive of that length, as full as a car's logs are: IMU 200 Hz, GNSS 10 Hz, 120 ms late, the further
+    messages that PX4 sends an onboard computer; one CAN frame with four wheels at 100 Hz among 1500 others a second."""
     target = folder / f"drive-{minutes:g}min-{SEED}"
-    if (target / "drive.log").is_file():
+    if (target / "fusiond.toml").is_file():
         return target
-    rounds = max(1, round(minutes / COURSE_MINUTES))
-    segments = "".join(
-        f"[[segment]]\nduration_s = {duration}\nspeed_mps = {speed}\nturn_deg = {turn}\n"
-        for duration, speed, turn in COURSE * rounds
+    segments, left = "", minutes * 60
+    for duration, speed, turn in cycle(COURSE):
+        if left < SHORTEST_S:
+            break
+        lasts = min(duration, left)
+        segments += f"[[segment]]\nduration_s = {lasts}\nspeed_mps = {speed}\nturn_deg = {turn}\n"
+        left -= lasts
+    sensors = (
+        "[autopilot]\ntelemetry = true\n[imu]\nrate_hz = 200.0\n[gnss]\nrate_hz = 10.0\ndelay_ms = 120.0\n"
+        "[wheels]\nrate_hz = 100.0\ntraffic_hz = 1400.0\n"
     )
-    sensors = "[imu]\nrate_hz = 200.0\n[gnss]\nrate_hz = 10.0\ndelay_ms = 120.0\n[wheels]\nrate_hz = 100.0\n"
     text = f"seed = {SEED}\n{sensors}{segments}"
     target.mkdir(parents=True, exist_ok=True)
     write_drive(parse(text), target)
@@ -223,8 +235,7 @@ def make_log(minutes: float, folder: Path) -> Path:
 
 
 def run_python(*arguments: str) -> tuple[float, float]:
-    """Seconds and peak memory [MB] of a Python process."""
-    begin = time.perf_counter()
+    """CPU time [s] and peak memory [MB] of a Python process: `-c CODE ...` or `MODULE ...`."""
     code = "import resource, runpy, sys; sys.argv = sys.argv[1:]; "
     if arguments[0] == "-c":
         code += arguments[1]
@@ -232,35 +243,35 @@ def run_python(*arguments: str) -> tuple[float, float]:
     else:
         code += f"runpy.run_module({arguments[0]!r}, run_name='__main__', alter_sys=True)"
         rest = list(arguments)
-    wrapped = f"{TELL_PEAK}\n{code}"
+    wrapped = f"{TELL_USAGE}\n{code}"
     done = subprocess.run([sys.executable, "-c", wrapped, *rest], check=True, capture_output=True, text=True)
-    seconds = time.perf_counter() - begin
-    peak = next(line for line in reversed(done.stdout.splitlines()) if line.startswith("PEAK"))
-    return seconds, int(peak.split()[1]) / 1024
+    _, seconds, peak = next(line for line in reversed(done.stdout.splitlines()) if line.startswith("USED")).split()
+    return float(seconds), int(peak) / 1024
 
 
 def log_lines(minutes: float, repeats: int, folder: Path) -> list[Line]:
     """Replay of a whole log against reading it, and the memory for a short and for the long one."""
-    long, short = make_log(minutes, folder), make_log(max(COURSE_MINUTES, minutes / 12), folder)
-    ours, theirs, peaks = [], [], []
+    long, short = make_log(minutes, folder), make_log(max(SHORTEST_S / 60, minutes / 12), folder)
+    tlog, candump = logs = [str(long / "drive.tlog"), str(long / "drive.log")]
+    used = []  # s, s, s, MB: MAVLink and CAN read, replay and its peak
     for _ in range(repeats):
-        logs = [str(long / "drive.tlog"), str(long / "drive.log")]
-        seconds, peak = run_python("fusiond", "replay", "--config", str(long / "fusiond.toml"), *logs)
-        ours.append(seconds)
-        peaks.append(peak)
-        theirs.append(run_python("-c", MAVLINK_ONLY, *logs)[0])
+        mavlink, _ = run_python("-c", READ_MAVLINK, tlog)
+        can, _ = run_python("-c", READ_CAN, candump)
+        used.append((mavlink, can, *run_python("fusiond", "replay", "--config", str(long / "fusiond.toml"), *logs)))
+    mavlink, can, mine, peak = (statistics.median(column) for column in zip(*used, strict=True))
+    theirs = statistics.median(each[0] + each[1] for each in used)
+    ratio = statistics.median(each[2] / (each[0] + each[1]) for each in used)
     logs = [str(short / "drive.tlog"), str(short / "drive.log")]
     _, short_peak = run_python("fusiond", "replay", "--config", str(short / "fusiond.toml"), *logs)
-    mine, other, peak = statistics.median(ours), statistics.median(theirs), statistics.median(peaks)
+    with (long / "drive.log").open("rb") as file:
+        frames = sum(1 for _ in file)
     size = sum((long / name).stat().st_size for name in ("drive.tlog", "drive.log")) / 1e6
-    frames = sum(1 for _ in (long / "drive.log").open("rb"))
-    what = f"replay of {minutes:g} min ({size:.0f} MB; {frames / minutes / 60:.0f} CAN frames a second)"
     return [
         Line(
-            what,
+            f"replay of {minutes:g} min ({size:.0f} MB; {frames / minutes / 60:.0f} CAN frames a second)",
             f"{mine:.1f} s",
-            f"pymavlink and python-can only reading it {other:.1f} s",
-            f"{mine / other:.2f} x",
+            f"only reading it: pymavlink {mavlink:.1f} s, python-can {can:.1f} s, both {theirs:.1f} s",
+            f"{ratio:.2f} x",
             "<= 0.5 x",
         ),
         Line(
@@ -309,7 +320,7 @@ def main(arguments: list[str]) -> None:
     lines += rewind_lines(unit, options.repeats)
     lines += start_lines(options.repeats)
     lines += log_lines(options.minutes, max(1, options.repeats // 2), options.out)
-    versions = f"fusiond {__version__}, Python {platform.python_version()}, NumPy {np.__version__}"
+    versions = f"CPU times, medians; fusiond {__version__}, Python {platform.python_version()}, NumPy {np.__version__}"
     about = f"{versions}, {platform.machine()}, seed {SEED}"
     report = f"{about}\n\n{table(lines)}\n"
     print(report)

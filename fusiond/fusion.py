@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from fusiond.clock import Clock
 from fusiond.config import Config, Imu
@@ -50,7 +51,7 @@ from fusiond.state import (
 LOST_IMU_NS = 5 * SECOND  # without an inertial sample for so long the state is called lost
 
 
-class Receipt(NamedTuple):
+class Receipt(Struct, frozen=True, gc=False):
     """What became of an event that was received."""
 
     measurement: Measurement
@@ -67,6 +68,7 @@ class Fusion:
         self.plan = plan(config)
         self.clock = Clock(config)
         self.history = History(self.plan, compiled)
+        self._unmodelled = frozenset(config.barometer) - frozenset(self.plan.sources)
         self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
             source: (imu_values if model == IMU else MODELS[model].values, section_of(source, model, config))
             for source, model in zip(self.plan.sources, self.plan.models, strict=True)
@@ -74,12 +76,15 @@ class Fusion:
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 
     def receive(self, received: Received) -> Receipt | None:
-        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only.
+        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only: pairs
+        of clocks, and sources that no observation model takes.
 
         The source must be one of the configuration's; ValueError otherwise.
         """
         measurement = self.clock.align(received)
-        return None if measurement is None else self.take(measurement)
+        if measurement is None or received.source in self._unmodelled:
+            return None
+        return self.take(measurement)
 
     def take(self, measurement: Measurement) -> Receipt:
         """Fuse an event that is aligned already."""

@@ -44,7 +44,9 @@ class OffsetFloor:
 
     def add(self, x: int, y: int) -> None:
         """Take in a point; x is raised to the newest one where it falls behind it."""
-        self._newest = x = max(x, self._newest)
+        if x < self._newest:
+            x = self._newest
+        self._newest = x
         complete = x - self._start >= self._length
         if complete:
             self._close(x)

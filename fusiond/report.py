@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 
@@ -16,6 +16,7 @@ from fusiond.estimate import Mode
 from fusiond.messages import StateMessage
 
 LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # bins of the latency histograms and where they end
+LATENCIES_AT_ONCE = 1024
 LISTED_STRETCHES = 50  # stretches of dead reckoning that are told one by one
 
 
@@ -113,11 +114,22 @@ class Latencies:
 
     def __init__(self) -> None:
         self._histogram = Histogram(LATENCY_STEP_MS, LATENCY_LIMIT_MS)
+        self._new: list[int] = []  # ns, not in the histogram yet
 
     def add(self, latency_ns: int) -> None:
-        self._histogram.add(latency_ns / 1e6)
+        new = self._new
+        new.append(latency_ns)
+        if len(new) == LATENCIES_AT_ONCE:
+            self._gather()
+
+    def _gather(self) -> None:
+        """Alike ones, as all of a stream without stamps are, go into the histogram together."""
+        for latency_ns, count in Counter(self._new).items():
+            self._histogram.add(latency_ns / 1e6, count)
+        self._new.clear()
 
     def report(self) -> Latency | None:
+        self._gather()
         histogram = self._histogram
         if not histogram.count:
             return None

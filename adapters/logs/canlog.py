@@ -32,7 +32,7 @@ from can.io.blf import BLFParseError
 from fusiond.config import Config
 from fusiond.measurements import Received
 
-from ..can import CanDecoder, frame_key
+from ..can import PDU2, CanDecoder, frame_key, parameter_group
 from . import LogError, LogInput
 
 TEXT = {".asc": "Vector ASC", ".trc": "PEAK TRC", ".csv": "python-can CSV"}
@@ -44,9 +44,10 @@ LINE = re.compile(
     rb"\s*\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"  # (seconds.fraction) channel id
     rb"#(?:#[0-9A-Fa-f])?([0-9A-Fa-f]*|[Rr][0-9A-Fa-f]?)(?:\s+[RTrt])?\s*"  # #data, ##flags data, or #R
 )
-PLAIN = (  # lines as candump itself writes them, of data frames whose ids are not among those at %b
-    rb"(?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*\n)++"
+OTHERS = (  # lines as candump itself writes them, of data frames whose ids are not among those at %(ids)b
+    rb"((?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%(ids)b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*+\n)*+)"
 )
+WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*+)\n)?+"  # the like, of an id that is
 LONGEST_LINE = 1 << 16  # bytes; more without a line's end is no text
 ERROR_FLAG, ID_BITS = 0x20000000, 0x1FFFFFFF  # in the 8-digit ids of candump
 MF4_MAGIC = (b"MDF", b"UnFinMF")
@@ -68,6 +69,29 @@ class _Frame(NamedTuple):
     data: bytes
 
 
+class _Wanted(NamedTuple):
+    """Which frames carry a wheel."""
+
+    keys: frozenset[int]  # see `frame_key`
+    groups: frozenset[int]  # J1939's PGNs
+
+    def holds(self, arbitration_id: int, is_extended: bool) -> bool:
+        if frame_key(arbitration_id, is_extended) in self.keys:
+            return True
+        return is_extended and parameter_group(arbitration_id) in self.groups
+
+    def patterns(self) -> Iterator[bytes]:
+        """Regular expressions of the ids as candump writes them."""
+        for key in self.keys:
+            yield b"%03X" % key if key <= 0x7FF else b"%08X" % (key & ID_BITS)
+        for group in self.groups:  # any priority, above the group's top bits; any destination, where it has one; any sender
+            heads = b"|".join(b"%02X" % (priority << 2 | group >> 16) for priority in range(8))
+            rest = b"%04X[0-9A-F]{2}" % (group & 0xFFFF)
+            if group >> 8 & 0xFF < PDU2:
+                rest = b"%02X[0-9A-F]{4}" % (group >> 8 & 0xFF)
+            yield b"(?:%b)%b" % (heads, rest)
+
+
 def read_can_log(
     log: LogInput, decoders: Mapping[str, CanDecoder], config: Config, *, named: bool = False
 ) -> Iterator[list[Received]]:
@@ -76,8 +100,9 @@ def read_can_log(
     `decoders`: by bus, those that may be in this log. `named`: the log was given as that of the only one of them.
     Raises LogError where nothing in the file is a CAN frame, or no bus can be told from its channels.
     """
-    keys = frozenset().union(*(decoder.keys for decoder in decoders.values()))
-    frames = _without_strays(_candump(log, keys) if log.suffix == ".log" else _python_can(log, keys), log)
+    keys, groups = zip(*((decoder.keys, decoder.groups) for decoder in decoders.values()), strict=True)
+    wanted = _Wanted(frozenset().union(*keys), frozenset().union(*groups))
+    frames = _without_strays(_candump(log, wanted) if log.suffix == ".log" else _python_can(log, wanted), log)
     head = list(islice(frames, DECISION))
     buses = _assign(log, [frame.channel for frame in head], decoders, config, named=named)
     for t_ns, channel, arbitration_id, is_extended, data in chain(head, frames):
@@ -115,7 +140,7 @@ def _assign(
     """The decoder of each channel, by the rule above; `seen`: the channels of the first wheel frames."""
     buses: dict[str | None, CanDecoder] = {}
     for name, decoder in decoders.items():
-        if decoder.keys:
+        if decoder.keys or decoder.groups:
             given = config.can[name].log_channel
             buses[name if given is None else given] = decoder
     channels = set(seen)
@@ -135,44 +160,50 @@ def _assign(
     raise LogError(f"{log.path}: wheel frames are on {listed}, wanted on {wanted}: set log_channel in [can.BUS]")
 
 
-def _candump(log: LogInput, keys: frozenset[int]) -> Iterator[_Frame]:
+def _candump(log: LogInput, wanted: _Wanted) -> Iterator[_Frame]:
     """The frames of a `candump -L` log whose ids are wanted. Most lines of a log are of other ids: stretches of them are
     passed over in one step."""
-    wanted = {b"%03X" % key if key <= 0x7FF else b"%08X" % (key & ID_BITS): key for key in keys}
-    others = re.compile(PLAIN % (b"|".join(wanted) or b"-"))  # no id begins with a dash
+    ids = b"|".join(wanted.patterns()) or b"-"  # no id begins with a dash
+    scan = re.compile((OTHERS + WANTED) % {b"ids": ids}).match
     counts = log.counts
     for text in _whole_lines(log):
         at = 0
         while at < len(text):
-            stretch = others.match(text, at)
-            if stretch is not None:
-                passed = text.count(b"\n", at, stretch.end())
-                counts["frames"] += passed
-                counts["other ids"] += passed
-                at = stretch.end()
-                continue
-            end = text.index(b"\n", at) + 1
-            frame = _frame(text[at:end], wanted, counts)
-            if frame is not None:
-                yield frame
-            at = end
+            found = scan(text, at)
+            assert found is not None, "it may be empty"
+            passed = text.count(b"\n", at, found.end(1))
+            counts["frames"] += passed
+            counts["other ids"] += passed
+            at = found.end()
+            seconds, micros, channel, digits, content = found.group(2, 3, 4, 5, 6)
+            if digits is not None:
+                counts["frames"] += 1
+                name, data = channel.decode("utf-8", "replace"), bytes.fromhex(content.decode("ascii"))
+                yield _Frame(int(seconds + micros) * 1000, name, int(digits, 16), len(digits) == 8, data)
+            elif at < len(text):
+                end = text.index(b"\n", at) + 1
+                frame = _frame(text[at:end], wanted, counts)
+                if frame is not None:
+                    yield frame
+                at = end
 
 
-def _frame(line: bytes, wanted: Mapping[bytes, int], counts: Counter[str]) -> _Frame | None:
-    """The frame in a line, if its id is wanted, by digits. Everything is counted."""
+def _frame(line: bytes, wanted: _Wanted, counts: Counter[str]) -> _Frame | None:
+    """The frame in a line, if its id is wanted. Everything is counted."""
     found = LINE.fullmatch(line)
     if found is None:
         counts["bad lines"] += bool(line.strip())
         return None
     seconds, fraction, channel, digits, content = found.groups()
-    key = wanted.get(digits) or wanted.get(digits.upper())
+    number, is_extended = int(digits, 16), len(digits) == 8
+    is_wanted = number <= ID_BITS and wanted.holds(number, is_extended)
     remote = content[:1] in (b"R", b"r")
-    if key is not None and not remote and len(content) % 2:
+    if is_wanted and not remote and len(content) % 2:
         counts["bad lines"] += 1
         return None
     counts["frames"] += 1
-    if key is None:
-        error = len(digits) == 8 and int(digits, 16) & ERROR_FLAG
+    if not is_wanted:
+        error = is_extended and number & ERROR_FLAG
         counts["error frames" if error else "other ids"] += 1
         return None
     if remote:
@@ -180,7 +211,7 @@ def _frame(line: bytes, wanted: Mapping[bytes, int], counts: Counter[str]) -> _F
         return None
     t_ns = int(seconds) * 10**9 + int(fraction.ljust(9, b"0"))
     data = bytes.fromhex(content.decode("ascii"))
-    return _Frame(t_ns, channel.decode("utf-8", "replace"), key & ID_BITS, len(digits) == 8, data)
+    return _Frame(t_ns, channel.decode("utf-8", "replace"), number, is_extended, data)
 
 
 def _whole_lines(log: LogInput) -> Iterator[bytes]:
@@ -200,14 +231,14 @@ def _whole_lines(log: LogInput) -> Iterator[bytes]:
         yield rest + b"\n"
 
 
-def _python_can(log: LogInput, keys: frozenset[int]) -> Iterator[_Frame]:
+def _python_can(log: LogInput, wanted: _Wanted) -> Iterator[_Frame]:
     """The frames, whose ids are wanted, of a log that python-can reads."""
     counts = log.counts
     for message in _messages(log):
         counts["frames"] += 1
         if message.is_error_frame:
             counts["error frames"] += 1
-        elif frame_key(message.arbitration_id, message.is_extended_id) not in keys:
+        elif not wanted.holds(message.arbitration_id, message.is_extended_id):
             counts["other ids"] += 1
         elif message.is_remote_frame:
             counts["remote frames"] += 1

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from struct import Struct
 
 import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
 from fusiond.simulation import wheels
@@ -16,14 +18,16 @@ from fusiond.simulation.drive import Drive, simulate
 from fusiond.simulation.gnss import UNKNOWN_16
 from fusiond.simulation.matching import configuration, dbc
 from fusiond.simulation.scenario import Scenario
+from fusiond.simulation.transport import Stamps
 from fusiond.simulation.truth import Truth
-from fusiond.simulation.wire import SYSTEM
+from fusiond.simulation.wire import SYSTEM, Telemetry
 
 STAMP = Struct(">Q")  # microseconds of Unix time
 COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 HDOP, VDOP, SATELLITES = 80, 120, 14  # of a fix; the first two in hundredths
 CHANNEL = "can0"
+LINES_AT_ONCE = 4096  # of one id that are held ready
 TRUTH_COLUMNS = "unix_us,lat_deg,lon_deg,height_m,vn_mps,ve_mps,vd_mps,roll_deg,pitch_deg,yaw_deg"
 TRUTH_ROW = "%d,%.9f,%.9f,%.4f,%.5f,%.5f,%.5f,%.5f,%.5f,%.5f\n"
 
@@ -51,7 +55,8 @@ def write_drive(scenario: Scenario, directory: str | Path, seed: int | None = No
 def write_tlog(drive: Drive, path: Path) -> None:
     """The MAVLink messages in the order of receipt, as MAVLink 2 frames behind their stamps."""
     link = common.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
-    streams = (_imu(drive), _gnss(drive), _system_time(drive), _heartbeats(drive))
+    telemetry = (_telemetry(drive.truth, stream) for stream in drive.telemetry)
+    streams = (_imu(drive), _gnss(drive), _system_time(drive), _heartbeats(drive), *telemetry)
     with path.open("wb") as file:
         for t_us, counter, message in heapq.merge(*streams, key=itemgetter(0)):
             link.seq = counter
@@ -111,21 +116,75 @@ def _heartbeats(drive: Drive) -> Stamped:
         )
 
 
+def _telemetry(truth: Truth, stream: Telemetry) -> Stamped:
+    make = TELEMETRY[stream.message]
+    columns = (stream.t_receive_us, stream.counter, stream.boot_ms, stream.row)
+    for t_us, counter, boot_ms, row in zip(*(column.tolist() for column in columns), strict=True):
+        yield t_us, counter, make(truth, row, boot_ms)
+
+
+def _attitude(truth: Truth, row: int, boot_ms: int) -> common.MAVLink_message:
+    return common.MAVLink_attitude_message(boot_ms, *truth.euler[row].tolist(), *truth.angular_rate_b[row].tolist())
+
+
+def _global_position(truth: Truth, row: int, boot_ms: int) -> common.MAVLink_message:
+    lat, lon = (round(math.degrees(angle[row]) * 1e7) for angle in (truth.latitude, truth.longitude))
+    height_mm, velocity = round(truth.height[row] * 1e3), (round(v * 1e2) for v in truth.velocity_n[row].tolist())
+    heading = round(math.degrees(truth.euler[row, 2]) * 1e2) % 36_000
+    return common.MAVLink_global_position_int_message(boot_ms, lat, lon, height_mm, 0, *velocity, heading)
+
+
+def _local_position(truth: Truth, row: int, boot_ms: int) -> common.MAVLink_message:
+    down = truth.height[0] - truth.height[row]
+    return common.MAVLink_local_position_ned_message(boot_ms, 0.0, 0.0, down, *truth.velocity_n[row].tolist())
+
+
+def _altitude(truth: Truth, row: int, boot_ms: int) -> common.MAVLink_message:
+    height = truth.height[row]
+    return common.MAVLink_altitude_message(boot_ms * 1000, height, height, height - truth.height[0], 0.0, 0.0, 0.0)
+
+
+def _vfr_hud(truth: Truth, row: int, _boot_ms: int) -> common.MAVLink_message:
+    heading, climb = round(math.degrees(truth.euler[row, 2])) % 360, -truth.velocity_n[row, 2]
+    return common.MAVLink_vfr_hud_message(0.0, truth.speed[row], heading, 50, truth.height[row], climb)
+
+
+def _servos(_truth: Truth, _row: int, boot_ms: int) -> common.MAVLink_message:
+    return common.MAVLink_servo_output_raw_message(boot_ms * 1000, 0, *(1500,) * 8)
+
+
+def _sys_status(_truth: Truth, _row: int, _boot_ms: int) -> common.MAVLink_message:
+    return common.MAVLink_sys_status_message(3, 3, 3, 420, 12_600, 350, 87, 0, 0, 0, 0, 0, 0)
+
+
+TELEMETRY: dict[str, Callable[[Truth, int, int], common.MAVLink_message]] = {  # from truth, its row, and boot time [ms]
+    "ATTITUDE": _attitude,
+    "GLOBAL_POSITION_INT": _global_position,
+    "LOCAL_POSITION_NED": _local_position,
+    "ALTITUDE": _altitude,
+    "VFR_HUD": _vfr_hud,
+    "SERVO_OUTPUT_RAW": _servos,
+    "SYS_STATUS": _sys_status,
+}
+
+
 def write_candump(drive: Drive, path: Path) -> None:
     """The CAN frames in the order of receipt, as `candump -L` writes them."""
     frames = drive.wheels
     data = wheels.frames(frames.raw, frames.fault, frames.counter)
     streams = [
-        _lines(wheels.FRAME_ID, frames.t_receive_us.tolist(), data.tolist()),
-        *(_lines(other.identifier, other.t_receive_us.tolist(), other.data.tolist()) for other in drive.chatter),
+        _lines(wheels.FRAME_ID, frames.t_receive_us, data),
+        *(_lines(other.identifier, other.t_receive_us, other.data) for other in drive.chatter),
     ]
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(line for _, line in heapq.merge(*streams, key=itemgetter(0)))
 
 
-def _lines(identifier: int, stamps_us: list[int], data: list[int]) -> Iterator[tuple[int, str]]:
-    for t_us, word in zip(stamps_us, data, strict=True):
-        yield t_us, f"({t_us // 1_000_000}.{t_us % 1_000_000:06d}) {CHANNEL} {identifier:03X}#{word:016X}\n"
+def _lines(identifier: int, t_receive_us: Stamps, data: NDArray[np.uint64]) -> Iterator[tuple[int, str]]:
+    for begin in range(0, len(data), LINES_AT_ONCE):
+        block = slice(begin, begin + LINES_AT_ONCE)
+        for t_us, word in zip(t_receive_us[block].tolist(), data[block].tolist(), strict=True):
+            yield t_us, f"({t_us // 1_000_000}.{t_us % 1_000_000:06d}) {CHANNEL} {identifier:03X}#{word:016X}\n"
 
 
 def write_truth(truth: Truth, rate_hz: float, path: Path) -> None:

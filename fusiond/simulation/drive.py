@@ -15,19 +15,30 @@ import numpy as np
 from fusiond.earth import Array
 from fusiond.measurements import Received
 from fusiond.simulation import gnss, imu, wheels
+from fusiond.simulation.chatter import FIRST_ID, TELEMETRY_HZ, traffic_rates
 from fusiond.simulation.gnss import Fixes
 from fusiond.simulation.scenario import WHEELS, Scenario, Transport
 from fusiond.simulation.trajectory import Trajectory
 from fusiond.simulation.transport import BootClock, Mask, Passage, Stamps, carry, within
 from fusiond.simulation.truth import Truth, motion, quaternions
-from fusiond.simulation.wire import CanFrames, GnssMessages, Heartbeats, ImuMessages, TimeMessages, WheelFrames
+from fusiond.simulation.wire import (
+    CanFrames,
+    GnssMessages,
+    Heartbeats,
+    ImuMessages,
+    Telemetry,
+    TimeMessages,
+    WheelFrames,
+)
 
 WHEEL_PHASE_S, STEERING_PHASE_S, SPEED_PHASE_S, BEACON_PHASE_S = 0.0013, 0.0027, 0.0041, 0.1  # beside whole instants
+TELEMETRY_PHASE_S, TRAFFIC_PHASE_S = 0.0007, 0.00037  # of the first; each further kind comes so much later again
 BEACON_SCATTER_S = 0.02  # SYSTEM_TIME and HEARTBEAT go out when the autopilot's scheduler finds the time
 GENERATORS = (
     *("imu_bias", "imu_noise", "imu_vibration", "gnss_white", "gnss_drift", "gnss_velocity"),
     *WHEELS,
     *("imu_link", "gnss_link", "time_link", "heartbeat_link", "wheels_link", "steering_link", "speed_link", "beacons"),
+    *("telemetry_link", "traffic_link", "traffic_data"),
 )
 
 
@@ -44,6 +55,7 @@ class Drive:
     heartbeats: Heartbeats
     wheels: WheelFrames
     chatter: tuple[CanFrames, ...]
+    telemetry: tuple[Telemetry, ...]
 
     def events(self) -> Iterator[Received]:
         """The events in the order of receipt, as the log readers decode them with the matching configuration."""
@@ -125,7 +137,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
         run.send_mavlink(t_beacon_ns, scenario.autopilot.transport, "time_link"),
         run.send_mavlink(t_beacon_ns, scenario.autopilot.transport, "heartbeat_link"),
     ]
-    counters = run.frame_counters(streams)
+    telemetry = _telemetry(run)
+    counters = run.frame_counters([*streams, *telemetry.values()])
     (i, t_i), (g, t_g), (s, t_s), (h, t_h) = (stream.receipt(scenario.host.offset_s) for stream in streams)
     stamps = {
         "unix": t_fix_ns // 1000,
@@ -147,7 +160,11 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
         time=TimeMessages(t_s, counters[2][s], t_beacon_ns[s] // 1000, run.clock.read(t_beacon_ns)[s] // 1_000_000),
         heartbeats=Heartbeats(t_h, counters[3][h]),
         wheels=_wheel_frames(run),
-        chatter=_chatter(run) if scenario.wheels.chatter else (),
+        chatter=(*(_chatter(run) if scenario.wheels.chatter else ()), *_traffic(run)),
+        telemetry=tuple(
+            _received(run, message, sent, counter)
+            for (message, sent), counter in zip(telemetry.items(), counters[len(streams) :], strict=True)
+        ),
     )
 
 
@@ -173,6 +190,25 @@ def _truth_and_imu(run: _Simulation) -> tuple[Truth, tuple[Array, Array]]:
         wheel_scale=wheels.scales(scenario.wheels),
     )
     return truth, (accel, gyro)
+
+
+def _telemetry(run: _Simulation) -> dict[str, _Sent]:
+    """What else the autopilot sends, if anything."""
+    if not run.scenario.autopilot.telemetry:
+        return {}
+    found = {}
+    for number, (message, rate_hz) in enumerate(TELEMETRY_HZ.items(), 1):
+        t_ns = run.unix(run.instants(rate_hz, number * TELEMETRY_PHASE_S))
+        found[message] = run.send_mavlink(t_ns, run.scenario.imu.transport, "telemetry_link")
+    return found
+
+
+def _received(run: _Simulation, message: str, sent: _Sent, counters: Stamps) -> Telemetry:
+    rows, t_receive_us = sent.receipt(run.scenario.host.offset_s)
+    since_s = (sent.t_origin_ns - run.scenario.start_ns) / 1e9
+    instants = np.minimum((since_s * run.scenario.imu.rate_hz).astype(np.int64), len(run.trajectory.t) - 1)
+    boot_ms = run.clock.read(sent.t_origin_ns) // 1_000_000
+    return Telemetry(message, t_receive_us, counters[rows], boot_ms[rows], instants[rows])
 
 
 def _fix_instants(run: _Simulation) -> Array:
@@ -222,3 +258,13 @@ def _chatter(run: _Simulation) -> tuple[CanFrames, ...]:
         rows, t_receive_us = sent.receipt(run.scenario.host.offset_s)
         found.append(CanFrames(identifier, t_receive_us, data[rows]))
     return tuple(found)
+
+
+def _traffic(run: _Simulation) -> Iterator[CanFrames]:
+    """Frames of further ids, full of anything."""
+    for number, rate_hz in enumerate(traffic_rates(run.scenario.wheels.traffic_hz)):
+        t = run.instants(rate_hz, (number + 1) * TRAFFIC_PHASE_S)
+        data = run.random["traffic_data"].integers(0, 1 << 64, len(t), np.uint64)
+        sent = run.send(run.unix(t), run.scenario.wheels.transport, "traffic_link", np.ones(len(t), np.bool_))
+        rows, t_receive_us = sent.receipt(run.scenario.host.offset_s)
+        yield CanFrames(FIRST_ID + number, t_receive_us, data[rows])

@@ -76,6 +76,7 @@ class Autopilot(Section, frozen=True, kw_only=True):
 
     boot_s: NotNegative = 60.0  # how long it has been running at the start
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0  # how much faster than true time its clock runs
+    telemetry: bool = False  # sends ATTITUDE and the like as well, as often as PX4 does to an onboard computer
     reboot: list[Reboot] = field(default_factory=list)
     transport: Transport = field(default_factory=Transport)
 
@@ -182,6 +183,7 @@ class Wheels(Section, frozen=True, kw_only=True):
     fault_s: list[Interval] = field(default_factory=list)  # the fault bit is set and the speeds are rubbish
     silent_s: list[Interval] = field(default_factory=list)  # no frames
     chatter: bool = True  # other frames on the bus as well (0x025, 0x0B4)
+    traffic_hz: Annotated[float, Meta(ge=0, le=10_000)] = 0.0  # frames a second of further ids (a car's: 1000 and more)
     transport: Transport = field(default_factory=lambda: Transport(latency_ms=0.2, jitter_ms=0.3))
 
 

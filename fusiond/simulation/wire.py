@@ -113,6 +113,17 @@ class Heartbeats:
 
 
 @dataclass(frozen=True, slots=True)
+class Telemetry:
+    """One of the messages that an autopilot sends besides, of no use to the filter."""
+
+    message: str
+    t_receive_us: Stamps
+    counter: Stamps
+    boot_ms: Stamps
+    row: Stamps  # of the truth that it tells
+
+
+@dataclass(frozen=True, slots=True)
 class WheelFrames:
     """The CAN frame of the wheels."""
 
