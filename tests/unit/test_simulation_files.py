@@ -13,6 +13,7 @@ from pymavlink import mavutil
 
 from fusiond import config
 from fusiond.measurements import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, WheelSpeed
+from fusiond.simulation.chatter import TELEMETRY_HZ
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import WHEELS, Scenario, load, parse
 from fusiond.toml_file import ConfigError
@@ -60,6 +61,29 @@ def noisy() -> Scenario:
 @pytest.fixture(scope="module")
 def written(noisy: Scenario, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {path.name: path for path in write_drive(noisy, tmp_path_factory.mktemp("drive"))}
+
+
+def test_what_else_is_on_the_wires_changes_no_event(tmp_path: Path) -> None:
+    """The further messages and frames come at their rates, tell the truth, and leave what is measured as it was."""
+    text = REST.format(2) + "[[segment]]\nduration_s = 8\nspeed_mps = 12.0\nturn_deg = 30.0\n"
+    full = "[autopilot]\ntelemetry = true\n[wheels]\ntraffic_hz = 1000.5\n"
+    events, paths = [], {}
+    for name, scenario in (("bare", parse(text)), ("full", parse(text + full))):
+        paths = {path.name: path for path in write_drive(scenario, tmp_path / name)}
+        log = open_logs([paths["drive.tlog"], paths["drive.log"]], config.load(paths["fusiond.toml"]))
+        events.append(list(log))
+    assert events[0] == events[1]
+    assert log.counts[str(paths["drive.tlog"])]["skipped"] == pytest.approx(10 * sum(TELEMETRY_HZ.values()), rel=0.01)
+    assert "lost" not in log.counts[str(paths["drive.tlog"])]
+    frames = list(can.LogReader(paths["drive.log"]))
+    assert sum(frame.arbitration_id >= 0x200 for frame in frames) == pytest.approx(10 * 1000.5, rel=0.01)
+    assert [frame.timestamp for frame in frames] == sorted(frame.timestamp for frame in frames)
+    link = mavutil.mavlink_connection(str(paths["drive.tlog"]), dialect="common")
+    told = [message for message in iter(link.recv_msg, None) if message.get_type() in TELEMETRY_HZ]
+    assert {message.get_type() for message in told} == set(TELEMETRY_HZ)
+    assert [m.groundspeed for m in told if m.get_type() == "VFR_HUD"][-1] == pytest.approx(12.0, abs=0.1)
+    assert [m.yaw for m in told if m.get_type() == "ATTITUDE"][-1] == pytest.approx(np.radians(30), abs=0.01)
+    link.close()
 
 
 def test_same_seed_writes_the_same_bytes(noisy: Scenario, written: dict[str, Path], tmp_path: Path) -> None:

@@ -1,0 +1,52 @@
+"""`python -m benchmarks.study [part ...] [--runs N] [--seed S] [--out DIR]`: the evidence of docs/study.md."""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.study import calibration, consistency, faults, ferry, heading, outage
+from benchmarks.study.report import Section, save
+from fusiond import __version__
+
+PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the number of runs of each
+    "consistency": (consistency.consistency, 100),
+    "bound": (consistency.bound, 100),
+    "outage": (outage.outage, 20),
+    "heading": (heading.heading, 100),
+    "faults": (faults.faults, 20),
+    "calibration": (calibration.calibration, 20),
+    "ferry": (ferry.ferry, 10),
+}
+HEAD = """# The study
+
+How far the estimator can be trusted, by simulated drives whose noise is what the configuration says. Made by
+`make study` (`python -m benchmarks.study`); the numbers below are its output. The same seed gives the same numbers.
+"""
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.study", description=__doc__)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="which; default: all")
+    parser.add_argument("--runs", type=int, help="runs of each part, in place of its own number")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of study.md and images/study")
+    options = parser.parse_args(arguments)
+    sections = {}
+    for name in options.parts or PARTS:
+        part, runs = PARTS[name]
+        begin = time.perf_counter()
+        sections[name] = part(options.runs or runs, options.seed)
+        print(f"{sections[name].text()}\n({time.perf_counter() - begin:.0f} s)\n", flush=True)
+    about = f"fusiond {__version__}, Python {platform.python_version()}, NumPy {np.__version__}, seed {options.seed}."
+    save(sections, f"{HEAD}\n{about}\n", options.out)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,150 @@
+"""The posterior Cramer-Rao bound of a drive: the Riccati recursion linearised at the true trajectory with the true noise.
+
+For a system with additive Gaussian noise Tichavsky, Muravchik, Nehorai (1998), equation 21, is the covariance recursion of
+the Kalman filter with Jacobians at the truth. The transition and its noise are computed here apart from the filter's own;
+the Jacobians of the measurements are the models', which tests hold to finite differences.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.study.runs import start_covariance, true_state
+from benchmarks.study.world import WHEEL_PHASE_S, World
+from fusiond.config import Config
+from fusiond.earth import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array
+from fusiond.elementary import square
+from fusiond.observe import CONSTRAINTS, MODELS
+from fusiond.plan import IMU, MODEL, plan
+from fusiond.rotation import quaternion, skew
+from fusiond.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    ERROR_SIZE,
+    GYRO_BIAS,
+    POSITION,
+    QUATERNION_EB,
+    RATE_B,
+    SCALE,
+    VELOCITY,
+    VELOCITY_E,
+)
+
+EARTH_SKEW = skew(np.array([0.0, 0.0, EARTH_RATE]))
+
+
+def dynamics(world: World, k: int) -> Array:
+    """F (n, n) of the error's differential equation between the k-th instant and the next."""
+    f = np.zeros((ERROR_SIZE, ERROR_SIZE))
+    mat_eb = (world.mat_eb[k] + world.mat_eb[k + 1]) / 2
+    force_e = (world.mat_eb[k] @ world.force_b[k] + world.mat_eb[k + 1] @ world.force_b[k + 1]) / 2
+    place = world.position_e[k]
+    r2 = float(place @ place)
+    f[POSITION, VELOCITY] = np.eye(3)
+    f[VELOCITY, POSITION] = GRAVITATIONAL_CONSTANT / r2**1.5 * (3 * np.outer(place, place) / r2 - np.eye(3))
+    f[VELOCITY, VELOCITY] = -2 * EARTH_SKEW
+    f[VELOCITY, ATTITUDE] = -skew(force_e)
+    f[VELOCITY, ACCEL_BIAS] = -mat_eb
+    f[ATTITUDE, ATTITUDE] = -EARTH_SKEW
+    f[ATTITUDE, GYRO_BIAS] = -mat_eb
+    return f
+
+
+def densities(config: Config) -> Array:
+    """Noise densities (n,) of the error state."""
+    (unit,) = config.imu.values()
+    found = np.zeros(ERROR_SIZE)
+    found[VELOCITY], found[ATTITUDE] = square(unit.accel_noise), square(unit.gyro_noise)
+    found[ACCEL_BIAS], found[GYRO_BIAS] = square(unit.accel_bias_walk), square(unit.gyro_bias_walk)
+    found[SCALE] = square(config.filter.wheel_scale_walk) if config.filter.wheel_scale_sigma else 0.0
+    return found
+
+
+def carried(p: Array, f: Array, density: Array, dt: float) -> Array:
+    """The covariance dt later; the noise is integrated by Simpson's rule."""
+
+    def transition(h: float) -> Array:
+        step = f * h
+        return np.eye(ERROR_SIZE) + step + step @ step / 2 + step @ step @ step / 6
+
+    whole, half = transition(dt), transition(dt / 2)
+    noise = np.diag(density) + 4 * (half * density) @ half.T + (whole * density) @ whole.T
+    return np.asarray(whole @ p @ whole.T + noise * (dt / 6))
+
+
+def updated(p: Array, jacobian: Array, variance: Array) -> Array:
+    across = p @ jacobian.T
+    gain = np.linalg.solve(jacobian @ across + np.diag(variance), across.T).T
+    keep = np.eye(len(p)) - gain @ jacobian
+    p = keep @ p @ keep.T + (gain * variance) @ gain.T
+    return np.asarray((p + p.T) / 2)
+
+
+class Bound:
+    """The recursion over one world, with the measurements that its configuration has."""
+
+    def __init__(self, world: World, wheel_hz: float, gnss_from: float = 0.0, gnss_until: float = np.inf) -> None:
+        self.world, self.config = world, world.config
+        self.plan = plan(self.config)
+        gnss = next(iter(self.config.gnss.values()))
+        fixes = world.times(gnss.interval_s, 0.0)
+        self.events = [(t, "gnss") for t in fixes if gnss_from - 1e-9 <= t < gnss_until]
+        self.events += [(t, "wheel") for t in world.times(1 / wheel_hz, WHEEL_PHASE_S)] if self.config.wheel else []
+        if self.config.motion.non_holonomic:
+            self.events += [(t, "constraint") for t in world.times(self.config.motion.interval_s, 0.0)[1:]]
+        self.events.sort()
+
+    def run(self, looks: list[float]) -> Array:
+        """Covariances (looks, n, n), each after all measurements stamped up to its time [s]."""
+        world, density = self.world, densities(self.config)
+        p, now, found = start_covariance(world, self.plan), 0.0, []
+        stops = sorted([*self.events, *((t + 1e-9, "look") for t in looks), *((t, "sample") for t in world.t[1:])])
+        f = dynamics(world, 0)
+        for t, what in stops:
+            if t > now + 1e-12:
+                k = min(int(now * world.sensor.rate_hz + 1e-6), len(world.t) - 2)
+                f = dynamics(world, k)
+                if what != "look":
+                    p, now = carried(p, f, density, t - now), t
+            if what == "look":
+                found.append(p)
+            elif what != "sample":
+                p = self.measured(p, t, what)
+        return np.array(found)
+
+    def measured(self, p: Array, t: float, what: str) -> Array:
+        """The covariance after all measurements of a kind at one instant."""
+        world = self.world
+        k = min(round(t * world.sensor.rate_hz), len(world.t) - 1)
+        state = true_state(world, k, len(self.plan.sources))
+        if what == "wheel":  # beside the IMU's instants
+            at = np.array([t])
+            kinematics = world.kinematics(at)
+            to_n = world.mat_ne[k]
+            state.nominal[VELOCITY_E] = to_n.T @ kinematics.velocity_n[0]
+            state.nominal[QUATERNION_EB] = quaternion(to_n.T @ kinematics.mat_nb[0])
+            state.auxiliary[RATE_B] = kinematics.rate_nb_b[0] + world.gyro_bias[k]
+        state.covariance[:] = p
+        if what == "constraint":
+            model, parameter = CONSTRAINTS[0], self.plan.constraints[0]
+            seen = model.observe(state, parameter, parameter)
+            return p if seen is None else updated(p, seen.jacobian, seen.variance)
+        for source, number in enumerate(self.plan.models):
+            if number == IMU or (number == MODEL["wheel_speed"]) != (what == "wheel"):
+                continue
+            seen = MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source])
+            assert seen is not None
+            p = updated(p, seen.jacobian, seen.variance)
+        return p
+
+    def row(self, number: int, source: int) -> Array:
+        """A measurement's row with its variances; the reading itself does not matter to the Jacobian."""
+        row = np.zeros(8)
+        gnss = next(iter(self.config.gnss.values()))
+        if number == MODEL["gnss_position"]:
+            row[3:5] = square(gnss.position_sigma_m), square(gnss.height_sigma_m)
+        elif number == MODEL["gnss_velocity"]:
+            row[3:5] = square(gnss.velocity_sigma_mps), 3.0
+        else:
+            row[1] = square(self.config.wheel[self.plan.sources[source]].sigma_mps)
+        return row
