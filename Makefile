@@ -34,7 +34,7 @@ demo-data: $(READY)
 	$(BIN)/fusiond simulate --config configs/simulate-demo.toml --out $(DEMO)
 	gzip -9nf $(DEMO)/drive.tlog $(DEMO)/drive.log $(DEMO)/truth.csv
 
-$(READY): pyproject.toml setup.py fusiond/_kernel.pyx
+$(READY): pyproject.toml setup.py fusiond/_kernel.pxi
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'

@@ -22,6 +22,7 @@ from fusiond.state import (
     ACCEL_BIAS,
     ALIGNING,
     ATTITUDE,
+    CALIBRATIONS,
     FIRST_VELOCITY_N,
     FIX_E,
     FIX_VARIANCE,
@@ -34,7 +35,6 @@ from fusiond.state import (
     MEAN_FORCE_B,
     MEAN_RATE_B,
     MEAN_WEIGHT,
-    MOUNT_ERROR,
     NEVER,
     PHASE,
     POSITION,
@@ -43,7 +43,6 @@ from fusiond.state import (
     RATE_B,
     REST_RATE_B,
     RUNNING,
-    SCALE,
     T_CONSTRAINT,
     T_FIRST_VELOCITY,
     T_FIX,
@@ -174,11 +173,11 @@ def _start(
     for block, sigma in (
         (GYRO_BIAS, min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma),
         (ACCEL_BIAS, plan.imu.accel_bias_sigma),
-        (SCALE, plan.filter.wheel_scale_sigma),
-        (MOUNT_ERROR, math.radians(plan.filter.mount_sigma_deg)),
     ):
         for i in range(block.start, block.stop):
             covariance[i, i] = square(sigma)
+    for i, first in enumerate(plan.calibration_variances, CALIBRATIONS):
+        covariance[i, i] = first
     stamps[[T_START, T_CONSTRAINT, T_POSITION]] = stamps[T]
     stamps[PHASE] = RUNNING
 

@@ -43,7 +43,8 @@ class Filter(Section, frozen=True, kw_only=True):
     level_sigma_deg: Positive = 3.0  # sigma of roll and pitch after leveling on the accelerometer
     position_timeout_s: Seconds = 2.0  # without a position fix for this long: dead reckoning
     lost_sigma_m: Positive = 200.0  # horizontal position sigma beyond which the state is called lost
-    wheel_scale_sigma: NotNegative = 0.01  # first sigma of the common wheel scale (1 = 100 %); 0 freezes it at zero
+    wheel_scale_sigma: NotNegative = 0.01  # first sigma of a wheel scale (1 = 100 %); 0 freezes it at zero
+    wheel_scale_by: Literal["vehicle", "axle", "wheel"] = "vehicle"  # one scale for all wheels, or for each axle or wheel
     wheel_scale_walk: NotNegative = 1e-5  # its random walk [1/sqrt(s)]
     mount_sigma_deg: NotNegative = 1.0  # first sigma of the IMU's pitch and yaw against the vehicle; 0 freezes them
     mount_walk_deg: NotNegative = 1e-3  # its random walk [deg/sqrt(s)]
@@ -120,6 +121,9 @@ class Gnss(Section, frozen=True, kw_only=True):
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the position was true
     velocity_delay_ms: Milliseconds = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
+    lever_arm_sigma_m: NotNegative = 0.0  # first sigma of the lever arm, per axis, which is then learnt; 0 freezes it
+    delay_sigma_ms: NotNegative = 0.0  # likewise, delay
+    velocity_delay_sigma_ms: NotNegative = 0.0  # likewise, velocity delay
     stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's own stamp, use the receipt less delay_ms
     position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and the least it is believed to be
     height_sigma_m: Positive = 3.0  # likewise, vertical
@@ -214,6 +218,23 @@ class Config(Section, frozen=True, kw_only=True):
         return tuple(sorted([*self.imu, *gnss, *self.wheel]))
 
 
+MOST_SCALES = 4
+
+
+def wheel_groups(config: Config) -> dict[str, int]:
+    """Of each wheel, the number of the scale that it shares with others: with all, with those of its axle, with none.
+    Axles are counted from the rear, wheels by name."""
+    by = config.filter.wheel_scale_by
+    keys = {name: {"vehicle": 0, "axle": wheel.position_m[0], "wheel": name}[by] for name, wheel in config.wheel.items()}
+    order = sorted(set(keys.values()), key=lambda key: (isinstance(key, str), key))
+    return {name: order.index(key) for name, key in keys.items()}
+
+
+def calibrated(gnss: Gnss) -> bool:
+    """Whether the filter learns anything of a receiver's installation."""
+    return max(gnss.lever_arm_sigma_m, gnss.delay_sigma_ms, gnss.velocity_delay_sigma_ms) > 0
+
+
 def load(file: str | Path) -> Config:
     """Read and check a configuration file. Raises ConfigError."""
     path = Path(file)
@@ -253,6 +274,12 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
             if name in taken:
                 found.append((f"{table}.{name}", f"[{taken[name]}.{name}] has this name; each source needs its own"))
             taken.setdefault(name, table)
+    learnt = [name for name, gnss in config.gnss.items() if calibrated(gnss)]
+    if len(learnt) > 1:
+        found.append((f"gnss.{learnt[1]}", f"the lever arm and delays of one receiver can be learnt: [gnss.{learnt[0]}]"))
+    groups = wheel_groups(config)
+    if len(set(groups.values())) > MOST_SCALES:
+        found.append(("filter.wheel_scale_by", f"at most {MOST_SCALES} scales, '{config.filter.wheel_scale_by}' makes more"))
     if config.record.file_mb * 2 > config.record.total_mb:
         found.append(("record.total_mb", f"must be at least twice file_mb ({config.record.file_mb:g} MB)"))
     if config.filter.imu_gap_s >= config.filter.horizon_s:

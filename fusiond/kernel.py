@@ -28,7 +28,6 @@ from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
     EMPTY,
-    ERROR_SIZE,
     FORCE_B,
     HELD_FORCE_B,
     HELD_RATE_B,
@@ -48,6 +47,7 @@ from fusiond.state import (
     T_REJECTED,
     VELOCITY,
     VELOCITY_E,
+    WIDE_SIZE,
     FilterState,
     T,
 )
@@ -88,9 +88,8 @@ class Kernel:
     """The operations of the hot loop for one plan, on the memory that `attach` gives it. The history decides what to do
     when; this does it."""
 
-    def __init__(self, plan: Plan, size: int = ERROR_SIZE) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self.size = size
 
     def attach(
         self,
@@ -398,9 +397,11 @@ def compiled_available() -> bool:
     return find_spec("fusiond._kernel") is not None
 
 
-def make_kernel(plan: Plan, compiled: bool | None = None, size: int = ERROR_SIZE) -> AnyKernel:
+def make_kernel(plan: Plan, compiled: bool | None = None) -> AnyKernel:
     """The compiled kernel, or its twin where it was not built; `compiled` asks for one of the two. ImportError if the
     compiled one is asked for and was not built."""
     if compiled is None:
         compiled = compiled_available()
-    return import_module("fusiond._kernel").Kernel(plan, size) if compiled else Kernel(plan, size)
+    if not compiled:
+        return Kernel(plan)
+    return import_module("fusiond._kernel_wide" if plan.size == WIDE_SIZE else "fusiond._kernel").Kernel(plan)

@@ -8,11 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from fusiond.config import Config, Filter, Imu, Motion
+from fusiond.config import Config, Filter, Imu, Motion, calibrated, wheel_groups
 from fusiond.earth import Array
 from fusiond.elementary import square
-from fusiond.observe import CONSTRAINTS, MODELS
+from fusiond.observe import CONSTRAINTS, MODELS, wheel_speed
 from fusiond.observe.model import PARAMETERS
+from fusiond.state import (
+    ANTENNA_ERROR,
+    CALIBRATIONS,
+    DELAYS_ERROR,
+    ERROR_SIZE,
+    FURTHER_SCALES_ERROR,
+    MOUNT_ERROR,
+    SCALE,
+    WIDE_SIZE,
+)
 from fusiond.strapdown import ProcessNoise
 from fusiond.update import chi_square, correlation_factor
 
@@ -34,6 +44,8 @@ class Plan:
     constraints: Array  # (3, PARAMETERS): non-holonomic, zero velocity, zero rotation
     gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
     noise: ProcessNoise
+    size: int  # of the error state
+    calibration_variances: Array  # (size - CALIBRATIONS,): first ones
     wheels: tuple[int, ...]  # indices of the sources that are wheels
     horizon_ns: int
     snapshot_interval_ns: int
@@ -69,6 +81,11 @@ def plan(config: Config) -> Plan:
         np.zeros(PARAMETERS) if model == IMU else MODELS[model].parameters(section_of(source, model, config))
         for source, model in zip(sources, models, strict=True)
     ]
+    groups = wheel_groups(config)
+    for row, source, model in zip(rows, sources, models, strict=True):
+        if model == MODEL["wheel_speed"]:
+            row[wheel_speed.SCALE_STATE] = _scale_state(groups[source])
+    first, walks = _calibrations(config)
     (imu,) = config.imu.values()
     motion, settings = config.motion, config.filter
     return Plan(
@@ -82,9 +99,10 @@ def plan(config: Config) -> Plan:
             gyro=square(imu.gyro_noise),
             accel_bias=square(imu.accel_bias_walk),
             gyro_bias=square(imu.gyro_bias_walk),
-            scale=square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0,
-            mount=square(math.radians(settings.mount_walk_deg)) if settings.mount_sigma_deg else 0.0,
+            calibrations=tuple(walks.tolist()),
         ),
+        size=CALIBRATIONS + len(first),
+        calibration_variances=first,
         wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
         horizon_ns=nanoseconds(settings.horizon_s),
         snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
@@ -99,3 +117,25 @@ def plan(config: Config) -> Plan:
         motion=motion,
         imu=imu,
     )
+
+
+def _scale_state(group: int) -> int:
+    """The error state of a group's wheel scale."""
+    return SCALE.start if group == 0 else FURTHER_SCALES_ERROR.start + group - 1
+
+
+def _calibrations(config: Config) -> tuple[Array, Array]:
+    """First variances, and random walks squared, of the error states from CALIBRATIONS on: those that are frozen have
+    neither. Short where none of the wider state is wanted: it costs time."""
+    settings = config.filter
+    first, walks = np.zeros(WIDE_SIZE), np.zeros(WIDE_SIZE)
+    scales = [_scale_state(group) for group in {0, *wheel_groups(config).values()}]
+    first[scales] = square(settings.wheel_scale_sigma)
+    walks[scales] = square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0
+    first[MOUNT_ERROR] = square(math.radians(settings.mount_sigma_deg))
+    walks[MOUNT_ERROR] = square(math.radians(settings.mount_walk_deg)) if settings.mount_sigma_deg else 0.0
+    for gnss in filter(calibrated, config.gnss.values()):
+        first[ANTENNA_ERROR] = square(gnss.lever_arm_sigma_m)
+        first[DELAYS_ERROR] = square(gnss.delay_sigma_ms * 1e-3), square(gnss.velocity_delay_sigma_ms * 1e-3)
+    size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
+    return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

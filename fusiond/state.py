@@ -21,9 +21,13 @@ VELOCITY_E = slice(3, 6)  # m/s, over ground, in earth-fixed axes
 QUATERNION_EB = slice(6, 10)  # body to earth-fixed
 GYRO_BIAS_B = slice(10, 13)  # rad/s
 ACCEL_BIAS_B = slice(13, 16)  # m/s^2
-WHEEL_SCALE = slice(16, 17)  # 1: what wheels read too much, shared by all
+WHEEL_SCALE = slice(16, 17)  # 1: what wheels read too much: those of the first group, which is all unless told otherwise
 MOUNT = slice(17, 19)  # rad: pitch and yaw of the IMU against the vehicle
-NOMINAL_SIZE = 19
+FURTHER_SCALES = slice(19, 22)  # 1: likewise, of the second to fourth group
+ANTENNA_B = slice(22, 25)  # m, what the antenna's lever arm is more than configured
+DELAYS = slice(25, 27)  # s, what the position's delay is more than configured, and the velocity's more than that
+HEIGHT_OFFSET = slice(27, 28)  # m, what the barometer reads too much
+NOMINAL_SIZE = 28
 
 # Error state: slices of a row or column of the covariance; true = nominal (+) error
 POSITION = slice(0, 3)  # m, e axes
@@ -34,6 +38,12 @@ ACCEL_BIAS = slice(12, 15)  # m/s^2, b axes
 SCALE = slice(15, 16)  # 1
 MOUNT_ERROR = slice(16, 18)  # rad
 ERROR_SIZE = 18
+FURTHER_SCALES_ERROR = slice(18, 21)  # 1; from here on only in a state of WIDE_SIZE
+ANTENNA_ERROR = slice(21, 24)  # m, b axes
+DELAYS_ERROR = slice(24, 26)  # s
+HEIGHT_OFFSET_ERROR = slice(26, 27)  # m
+WIDE_SIZE = 27
+CALIBRATIONS = 15  # error states from here on belong to the installation; their nominal states follow one higher
 
 # Auxiliary numbers: slices of FilterState.auxiliary
 HELD_FORCE_B = slice(0, 3)  # m/s^2, the newest inertial sample behind the state

@@ -14,17 +14,14 @@ from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
     ATTITUDE,
+    CALIBRATIONS,
     GYRO_BIAS,
     GYRO_BIAS_B,
-    MOUNT,
-    MOUNT_ERROR,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
-    SCALE,
     VELOCITY,
     VELOCITY_E,
-    WHEEL_SCALE,
     FilterState,
 )
 
@@ -33,8 +30,6 @@ ADDED = (
     (VELOCITY_E, VELOCITY),
     (GYRO_BIAS_B, GYRO_BIAS),
     (ACCEL_BIAS_B, ACCEL_BIAS),
-    (WHEEL_SCALE, SCALE),
-    (MOUNT, MOUNT_ERROR),
 )
 
 
@@ -127,4 +122,5 @@ def inject(state: FilterState, error: Array) -> None:
     x = state.nominal
     for nominal, block in ADDED:
         x[nominal] += error[block]
+    x[CALIBRATIONS + 1 : state.size + 1] += error[CALIBRATIONS:]
     x[QUATERNION_EB] = normalised(quaternion_multiply(quaternion_exp(error[ATTITUDE]), x[QUATERNION_EB]))

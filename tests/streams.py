@@ -16,7 +16,7 @@ from fusiond.fusion import Fusion
 from fusiond.kernel import ROW, Outcome
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.rotation import matrix_from_euler, quaternion
-from fusiond.state import PHASE, POSITION_E, QUATERNION_EB, RUNNING, VELOCITY_E, FilterState, T
+from fusiond.state import ERROR_SIZE, PHASE, POSITION_E, QUATERNION_EB, RUNNING, VELOCITY_E, FilterState, T
 
 MS = 1_000_000  # ns
 SECOND = 1_000 * MS
@@ -157,17 +157,22 @@ def fuse(configuration: Config, events: Iterable[Measurement], compiled: bool | 
     return fusion
 
 
-def running_state(rng: np.random.Generator, sources: int = 7, start: tuple[float, float, float] = MUNICH) -> FilterState:
+def running_state(
+    rng: np.random.Generator,
+    sources: int = 7,
+    start: tuple[float, float, float] = MUNICH,
+    size: int = ERROR_SIZE,
+) -> FilterState:
     """A running filter state with everything at random sizes that occur, and a full covariance."""
-    state = FilterState(sources)
-    x = state.nominal
+    state = FilterState(sources, size)
+    x = state.nominal[: size + 1]
     x[:] = rng.normal(0.0, 0.01, len(x))
     x[POSITION_E] = ecef(*start) + rng.normal(0.0, 100.0, 3)
     x[VELOCITY_E] = rng.normal(0.0, 10.0, 3)
     x[QUATERNION_EB] = quaternion(matrix_from_euler(*(float(a) for a in rng.uniform(-1.5, 1.5, 3))))
     root = rng.normal(0.0, 1.0, (state.size, state.size)) + 2 * np.eye(state.size)
-    scale = np.repeat([1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3], [3, 3, 3, 3, 3, 3])
-    covariance = scale[:, None] * (root @ root.T) * scale / 18
+    scale = np.repeat([1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])[:size]
+    covariance = scale[:, None] * (root @ root.T) * scale / size
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)
     state.auxiliary[[2, 8]] -= 9.8

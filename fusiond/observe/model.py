@@ -32,7 +32,7 @@ PARAMETERS = 12  # width of a source's row
 SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
 LEVER_ARM_B = slice(0, 3)  # parameters that models share: m, the sensor from the IMU
 CORRELATION = 3  # s, over which the sensor's errors stay alike
-
+CALIBRATED = 4  # 1 where lever arm and delays of this receiver are states of the filter
 
 
 class Unusable(Exception):
