@@ -9,14 +9,14 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memmove, memset
 
 from fusiond import state as layout
-from fusiond import alignment, motion, observe, strapdown
+from fusiond import alignment, health, kernel, motion, observe, strapdown, update as updates
 from fusiond.earth import GRAVITY_RATIO as _GRAVITY_RATIO
 from fusiond.kernel import Outcome
 from fusiond.observe import wheel_speed
 
 cdef enum:
     VALUES = 8
-    PARAMETERS = 12
+    PARAMETERS = 16
 
 cdef struct Row:
     int64_t t_ns
@@ -77,7 +77,18 @@ cdef enum:
     AUXILIARY_SIZE = 35
     LAST_VALUE = 0
     LAST_RATIO = 1
-    MEMORY_SIZE = 2
+    NOISE_EXCESS = 2
+    NOMINAL = 3
+    NOISY = 4
+    BIASED = 5
+    FROZEN = 6
+    BIAS = 7
+    BIAS_VARIANCE = 10
+    LAST_SUM = 11
+    INTERVAL = 12
+    LAST_INNOVATION = 13
+    MEAN_NIS = 16
+    MEMORY_SIZE = 17
     T = 0
     T_IMU = 1
     T_CONSTRAINT = 2
@@ -94,7 +105,9 @@ cdef enum:
     T_LAST = 0
     T_FUSED = 1
     T_REJECTED = 2
-    SOURCE_STAMPS_SIZE = 3
+    T_JUDGED = 3
+    T_ALIKE = 4
+    SOURCE_STAMPS_SIZE = 5
     ALIGNING = 1
     RUNNING = 2
     FUSED = 0
@@ -104,6 +117,11 @@ cdef enum:
     GNSS_POSITION = 0
     GNSS_VELOCITY = 1
     WHEEL_SPEED = 2
+    NOISE_LEAST = 8
+    NOISE_MOST = 9
+    SHARED = 10
+    COMPANION = 11
+    CLUTTER = 12
     COMPILED = 3  # models that this kernel knows; others stop it, and the twin takes one step
 
 cdef int64_t NEVER = -(<int64_t>1 << 62)
@@ -128,6 +146,33 @@ cdef int64_t WINDOW_MOST_NS = alignment.WINDOW_MOST_NS
 cdef double LEAST_TRACK_SPEED = wheel_speed.LEAST_TRACK_SPEED
 cdef double SURE_SPEED = wheel_speed.SURE_SPEED
 cdef double DIRECTION_ALIKE = wheel_speed.DIRECTION_ALIKE
+cdef int64_t GNSS_FRESH_NS = motion.GNSS_FRESH_NS
+cdef double CARRIED = motion.CARRIED
+cdef double UNIFORM = updates.UNIFORM
+cdef double NEGLIGIBLE = updates.NEGLIGIBLE
+cdef int64_t BREAK_NS = kernel.BREAK_NS
+cdef int64_t OUTAGE_NS = kernel.OUTAGE_NS
+cdef int64_t SUSPECT = kernel.SUSPECT
+cdef double NEAR = kernel.NEAR
+cdef int64_t JUDGE_NS = health.JUDGE_NS
+cdef double KEEPS = health.KEEPS
+cdef double PRIOR[4]
+PRIOR[:] = health.PRIOR
+cdef double OUTLIERS = health.OUTLIERS
+cdef double OUTLIER_VARIANCE = health.OUTLIER_VARIANCE
+cdef double NOISY_VARIANCE = health.NOISY_VARIANCE
+cdef double FIRST_BIAS_VARIANCE = health.FIRST_BIAS_VARIANCE
+cdef double BIAS_WALK = health.BIAS_WALK
+cdef double FARTHEST = health.FARTHEST
+cdef double LEAST_BIAS = health.LEAST_BIAS
+cdef double SAME_IF_NOT_FROZEN = health.SAME_IF_NOT_FROZEN
+cdef double OTHER_IF_FROZEN = health.OTHER_IF_FROZEN
+cdef double NOTED = health.NOTED
+cdef double DISTRUST = health.DISTRUST
+cdef double NOISE_TIME = health.NOISE_TIME
+cdef double CLIPPED = health.CLIPPED
+cdef double INTERVAL_SHARE = health.INTERVAL_SHARE
+cdef double NIS_TIME = health.NIS_TIME
 
 
 def check_layout():
@@ -140,14 +185,16 @@ def check_layout():
         ("HELD_RATE_B", HELD_RATE_B), ("FORCE_B", FORCE_B), ("RATE_B", RATE_B), ("MEAN_FORCE_B", MEAN_FORCE_B),
         ("MEAN_RATE_B", MEAN_RATE_B), ("CONSTRAINT_RATIO", CONSTRAINT_RATIO), ("CONSTRAINT_FUSED", CONSTRAINT_FUSED),
         ("CONSTRAINT_REJECTED", CONSTRAINT_REJECTED),
-        ("ANTENNA_B", ANTENNA_B), ("DELAYS", DELAYS), ("ANTENNA_ERROR", ANTENNA_ERROR), ("DELAYS_ERROR", DELAYS_ERROR),
+        ("BIAS", BIAS), ("LAST_INNOVATION", LAST_INNOVATION), ("BELIEF", NOMINAL), ("ANTENNA_B", ANTENNA_B), ("DELAYS", DELAYS), ("ANTENNA_ERROR", ANTENNA_ERROR), ("DELAYS_ERROR", DELAYS_ERROR),
         ("REST_RATE_B", REST_RATE_B), ("FIRST_VELOCITY_N", FIRST_VELOCITY_N),
     ):
         assert getattr(layout, name).start == offset, name
     for name, number in (
         ("NOMINAL_SIZE", NOMINAL_SIZE), ("CALIBRATIONS", CALIBRATIONS), ("WIDE_SIZE", WIDE_SIZE), ("SCATTER_FORCE", SCATTER_FORCE), ("SCATTER_RATE", SCATTER_RATE),
         ("MEAN_WEIGHT", MEAN_WEIGHT), ("AUXILIARY_SIZE", AUXILIARY_SIZE), ("LAST_VALUE", LAST_VALUE),
-        ("LAST_RATIO", LAST_RATIO), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
+        ("LAST_RATIO", LAST_RATIO), ("NOISE_EXCESS", NOISE_EXCESS), ("NOMINAL", NOMINAL), ("NOISY", NOISY),
+        ("BIASED", BIASED), ("FROZEN", FROZEN), ("BIAS_VARIANCE", BIAS_VARIANCE), ("LAST_SUM", LAST_SUM),
+        ("INTERVAL", INTERVAL), ("MEAN_NIS", MEAN_NIS), ("T_JUDGED", T_JUDGED), ("T_ALIKE", T_ALIKE), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
         ("T_CONSTRAINT", T_CONSTRAINT), ("T_STILL", T_STILL), ("T_POSITION", T_POSITION),
         ("T_FIRST_VELOCITY", T_FIRST_VELOCITY), ("T_REST", T_REST), ("ALIGNING", ALIGNING), ("PHASE", PHASE),
         ("RESETS", RESETS), ("BLOWN", BLOWN), ("STAMPS_SIZE", STAMPS_SIZE), ("T_LAST", T_LAST), ("T_FUSED", T_FUSED),
@@ -155,6 +202,11 @@ def check_layout():
     ):
         assert getattr(layout, name) == number, name
     assert [model.name for model in observe.MODELS[:COMPILED]] == ["gnss_position", "gnss_velocity", "wheel_speed"]
+    for name, number in (
+        ("NOISE_LEAST", NOISE_LEAST), ("NOISE_MOST", NOISE_MOST), ("SHARED", SHARED), ("COMPANION", COMPANION),
+        ("CLUTTER", CLUTTER), ("PARAMETERS", PARAMETERS), ("VALUES", VALUES),
+    ):
+        assert getattr(observe.model, name) == number, name
     assert (Outcome.FUSED, Outcome.REJECTED, Outcome.DUPLICATE) == (FUSED, REJECTED, DUPLICATE)
 
 
@@ -785,20 +837,15 @@ cdef bint cholesky(double s[3][3], double* variance, double factor, int m, doubl
     return True
 
 
-cdef double update(double* x, double* p, Observation* seen, double gate, double factor,
-                   double* spread_diagonal) noexcept nogil:
-    """Fuse unless the test ratio exceeds 1; returns the ratio. Infinite: S is not positive definite or not finite."""
-    cdef double across[3][n]
-    cdef double gain[3][n]
-    cdef double kept[3][n]
-    cdef double s[3][3]
-    cdef double low[3][3]
-    cdef double solved[3]
-    cdef double error[n]
-    cdef double part[4]
-    cdef double turned[4]
-    cdef double ratio = 0.0, rest, h
-    cdef int i, j, k, a, m = seen.m
+cdef struct Update:
+    double ratio
+    bint fused
+
+
+cdef void project(double* p, Observation* seen, double across[3][n], double s[3][3]) noexcept nogil:
+    """H P and H P H'."""
+    cdef double rest, h
+    cdef int i, k, a, m = seen.m
     for a in range(m):
         memset(across[a], 0, n * sizeof(double))
         for k in range(n):
@@ -812,21 +859,61 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double 
                 rest += seen.jacobian[a * n + k] * across[i][k]
             s[a][i] = rest
             s[i][a] = rest
-        if spread_diagonal != NULL:
-            spread_diagonal[a] = s[a][a] + seen.variance[a]
-    if not cholesky(s, seen.variance, 1.0, m, low):
-        return INFINITY
-    for i in range(m):
+
+
+cdef bint whiten(double s[3][3], Observation* seen, double* variance, double* whitened) noexcept nogil:
+    """fusiond.update.whiten, of H P H' and a variance."""
+    cdef double low[3][3]
+    cdef double rest
+    cdef int i, k
+    if not cholesky(s, variance, 1.0, seen.m, low):
+        return False
+    for i in range(seen.m):
         rest = seen.innovation[i]
         for k in range(i):
-            rest -= low[i][k] * solved[k]
-        solved[i] = rest / low[i][i]
-        ratio += solved[i] * solved[i]
-    ratio = ratio / gate
-    if not ratio <= 1:
-        return ratio if ratio > 1 else INFINITY
-    if factor != 1.0 and not cholesky(s, seen.variance, factor, m, low):
-        return INFINITY
+            rest -= low[i][k] * whitened[k]
+        whitened[i] = rest / low[i][i]
+    return True
+
+
+cdef double detection(double distance, int m, double clutter) noexcept nogil:
+    cdef double density = (1 - clutter) * exponential(-distance / 2), uniform = clutter
+    cdef int i
+    for i in range(m):
+        uniform *= UNIFORM
+    return density / (density + uniform)
+
+
+cdef Update update(double* x, double* p, Observation* seen, double gate, double factor, bint trusted,
+                   double clutter, double across[3][n], double s[3][3]) noexcept nogil:
+    """fusiond.update.update, for an observation that was projected."""
+    cdef Update result = Update(INFINITY, False)
+    cdef double gain[3][n]
+    cdef double kept[3][n]
+    cdef double low[3][3]
+    cdef double solved[3]
+    cdef double error[n]
+    cdef double part[4]
+    cdef double turned[4]
+    cdef double before[n * n]
+    cdef double distance = 0.0, h, share = 1.0, mixed
+    cdef int i, j, k, a, m = seen.m
+    if not whiten(s, seen, seen.variance, solved):
+        return result
+    for i in range(m):
+        distance += solved[i] * solved[i]
+    if not distance / gate < INFINITY:
+        return result
+    result.ratio = distance / gate
+    if not trusted or (clutter == 0 and not result.ratio <= 1):
+        return result
+    if clutter != 0:
+        share = detection(distance, m, clutter)
+        if share < NEGLIGIBLE:
+            return result
+        memcpy(before, p, n * n * sizeof(double))
+    if not cholesky(s, seen.variance, factor, m, low):
+        return result
     # gain' = S^-1 (P H')'
     for i in range(m):
         for j in range(n):
@@ -860,6 +947,13 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double 
         error[j] = 0.0
     for a in range(m):
         axpy(error, seen.innovation[a], gain[a])
+    if share < 1:
+        mixed = share * (1 - share)
+        for i in range(n):
+            for j in range(n):
+                p[i * n + j] = share * p[i * n + j] + (1 - share) * before[i * n + j] + mixed * (error[i] * error[j])
+        for i in range(n):
+            error[i] = share * error[i]
     for i in range(3):
         x[POSITION_E + i] += error[POSITION + i]
         x[VELOCITY_E + i] += error[VELOCITY + i]
@@ -871,7 +965,107 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double 
     quaternion_multiply(part, x + QUATERNION_EB, turned)
     normalise(turned)
     memcpy(x + QUATERNION_EB, turned, 4 * sizeof(double))
-    return ratio
+    result.fused = share >= 0.5
+    return result
+
+
+# ---------------------------------------------------------------- health (fusiond.health)
+
+cdef void begin_health(double* memory) noexcept nogil:
+    cdef int i
+    for i in range(4):
+        memory[NOMINAL + i] = PRIOR[i]
+    for i in range(3):
+        memory[BIAS + i] = 0.0
+    memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
+
+
+cdef double density(double square, double variance, int m) noexcept nogil:
+    cdef double root = sqrt(variance), scale = 1.0
+    cdef int i
+    for i in range(m):
+        scale *= root
+    return exponential(-square / (2 * variance)) / scale
+
+
+cdef void judge(double* memory, int64_t* stamps, double* whitened, int m, bint same, int64_t t_ns) noexcept nogil:
+    cdef double likelihood[4]
+    cdef double elapsed = KEEPS, blurred, total = 0.0, square = 0.0, off = 0.0, stretch = 1.0, size = 0.0, rest, outlier, alike
+    cdef double variance, gain
+    cdef int i
+    if memory[NOMINAL] + memory[NOISY] + memory[BIASED] + memory[FROZEN] == 0:
+        begin_health(memory)
+    if stamps[T_JUDGED] != NEVER:
+        elapsed = (t_ns - stamps[T_JUDGED]) * 1e-9
+    stamps[T_JUDGED] = t_ns
+    blurred = 1 - exponential(-elapsed / KEEPS)
+    if memory[BIAS_VARIANCE] < 1.0:
+        for i in range(m):
+            size += memory[BIAS + i] * memory[BIAS + i]
+        size = sqrt(size)
+        if 1e-9 < size < LEAST_BIAS:
+            stretch = LEAST_BIAS / size
+    for i in range(m):
+        square += whitened[i] * whitened[i]
+        rest = whitened[i] - memory[BIAS + i] * stretch
+        off += rest * rest
+    if square > FARTHEST:
+        square = FARTHEST
+    outlier = density(square, OUTLIER_VARIANCE, m)
+    alike = SAME_IF_NOT_FROZEN if same else 1.0
+    likelihood[0] = ((1 - OUTLIERS) * density(square, 1.0, m) + OUTLIERS * outlier) * alike
+    likelihood[1] = ((1 - OUTLIERS) * density(square, NOISY_VARIANCE, m) + OUTLIERS * outlier) * alike
+    likelihood[2] = ((1 - OUTLIERS) * density(off, 1 + memory[BIAS_VARIANCE], m) + OUTLIERS * outlier) * alike
+    likelihood[3] = outlier * (1.0 if same else OTHER_IF_FROZEN)
+    for i in range(4):
+        memory[NOMINAL + i] = (memory[NOMINAL + i] + blurred * (PRIOR[i] - memory[NOMINAL + i])) * likelihood[i]
+        total += memory[NOMINAL + i]
+    for i in range(4):
+        memory[NOMINAL + i] = memory[NOMINAL + i] / total
+    variance = memory[BIAS_VARIANCE] + BIAS_WALK
+    gain = variance / (variance + 1)
+    for i in range(m):
+        memory[BIAS + i] += gain * (whitened[i] - memory[BIAS + i])
+    memory[BIAS_VARIANCE] = (1 - gain) * variance
+
+
+cdef bint arrive(double* memory, int64_t* stamps, Row* row) noexcept nogil:
+    cdef double total = row.values[0] + row.values[1] + row.values[2], elapsed, share
+    cdef bint same = stamps[T_LAST] != NEVER and total == memory[LAST_SUM]
+    memory[LAST_SUM] = total
+    if stamps[T_LAST] != NEVER and row.t_ns > stamps[T_LAST]:
+        elapsed = (row.t_ns - stamps[T_LAST]) * 1e-9
+        share = INTERVAL_SHARE if memory[INTERVAL] > 0 else 1.0
+        memory[INTERVAL] += share * ((elapsed if elapsed < 10.0 else 10.0) - memory[INTERVAL])
+    return same
+
+
+cdef bint is_trusted(double* memory) noexcept nogil:
+    return memory[BIASED] + memory[FROZEN] <= DISTRUST
+
+
+cdef void learn(double* memory, Observation* seen, double* given, double s[3][3], double elapsed) noexcept nogil:
+    cdef double found = 0.0, configured = 0.0, nis = 0.0, square, spread
+    cdef int a
+    for a in range(seen.m):
+        square = seen.innovation[a] * seen.innovation[a]
+        spread = s[a][a] + given[a]
+        nis += square / spread
+        found += (square if square < CLIPPED * spread else CLIPPED * spread) - s[a][a]
+        configured += given[a]
+    memory[MEAN_NIS] += elapsed / (NIS_TIME + elapsed) * (nis / seen.m - memory[MEAN_NIS])
+    if configured > 0:
+        memory[NOISE_EXCESS] += elapsed / (NOISE_TIME + elapsed) * (found / configured - 1 - memory[NOISE_EXCESS])
+
+
+cdef bint moved(double* memory, Observation* seen, double gate) noexcept nogil:
+    cdef double total = 0.0, step
+    cdef int a
+    for a in range(seen.m):
+        step = seen.innovation[a] - memory[LAST_INNOVATION + a]
+        total += step * step / (2 * seen.variance[a])
+        memory[LAST_INNOVATION + a] = seen.innovation[a]
+    return not total <= gate
 
 
 # ---------------------------------------------------------------- the loop (fusiond.kernel, fusiond.motion)
@@ -879,13 +1073,13 @@ cdef double update(double* x, double* p, Observation* seen, double gate, double 
 cdef class Kernel:
     """The compiled counterpart of fusiond.kernel.Kernel, for one plan."""
 
-    cdef int sources
+    cdef int sources, imu_source
     cdef int32_t[::1] models
     cdef double[:, ::1] parameters
     cdef double[:, ::1] constraints
     cdef double gates[4]
     cdef Noise noise
-    cdef int64_t imu_gap, restart_gap, gnss_reset, constraint_interval, still_after, snapshot_interval
+    cdef int64_t imu_gap, restart_gap, gnss_reset, gnss_return, constraint_interval, still_after, snapshot_interval
     cdef bint standstill, non_holonomic
     cdef double course_speed, still_wheel, still_gyro2, still_accel2, zero_velocity_factor
     cdef double[::1] head_numbers
@@ -909,6 +1103,7 @@ cdef class Kernel:
         if plan.size != n:
             raise ValueError(f"compiled for {n} error states, not {plan.size}")
         self.sources = len(plan.sources)
+        self.imu_source = plan.imu_source
         self.models = np.array(plan.models, dtype=np.int32)
         self.parameters = np.ascontiguousarray(plan.parameters)
         self.constraints = np.ascontiguousarray(plan.constraints)
@@ -922,6 +1117,7 @@ cdef class Kernel:
         self.imu_gap = plan.imu_gap_ns
         self.restart_gap = plan.restart_gap_ns
         self.gnss_reset = plan.gnss_reset_ns
+        self.gnss_return = plan.gnss_return_ns
         self.constraint_interval = plan.constraint_interval_ns
         self.still_after = plan.still_after_ns
         self.snapshot_interval = plan.snapshot_interval_ns
@@ -961,7 +1157,7 @@ cdef class Kernel:
         carried = self.stamps[T_IMU] + self.imu_gap
         if t_ns < carried:
             carried = t_ns
-        if carried < begin:
+        if carried < begin or not is_trusted(self.memory + self.imu_source * MEMORY_SIZE):
             carried = begin
         if carried > begin:
             propagate(self.x, self.p, (carried - begin) * 1e-9, self.auxiliary + HELD_FORCE_B,
@@ -1200,7 +1396,8 @@ cdef class Kernel:
             return
         dt = (t_ns - begin) * 1e-9
         self.stamps[T] = t_ns
-        if imu == NULL or held == NEVER or imu.t_ns - held > self.imu_gap:
+        if imu == NULL or held == NEVER or imu.t_ns - held > self.imu_gap or \
+                not is_trusted(self.memory + self.imu_source * MEMORY_SIZE):
             coast(self.x, self.p, dt, &self.noise)
             return
         span = <double>(imu.t_ns - held)
@@ -1217,8 +1414,14 @@ cdef class Kernel:
 
     cdef void hold(self, Row* row) noexcept nogil:
         cdef double dt = 0.0
+        cdef double* memory = self.memory + row.source * MEMORY_SIZE
+        cdef int64_t* stamps = self.source_stamps + row.source * SOURCE_STAMPS_SIZE
+        cdef bint same
         if self.stamps[T_IMU] != NEVER:
             dt = (row.t_ns - self.stamps[T_IMU]) * 1e-9
+        same = arrive(memory, stamps, row)
+        if stamps[T_JUDGED] == NEVER or row.t_ns - stamps[T_JUDGED] >= JUDGE_NS:
+            judge(memory, stamps, NULL, 0, same, row.t_ns)
         self.keep_sample(row)
         self.watch(row, dt)
         self.constrain()
@@ -1257,7 +1460,30 @@ cdef class Kernel:
                     fresh += 1
                     if not fabs(self.memory[i * MEMORY_SIZE + LAST_VALUE]) <= self.still_wheel:
                         return False
-        return fresh > 0 or wheels == 0
+        return (fresh > 0 or wheels == 0) and not self.carried(0.0)
+
+    cdef bint carried(self, double speed) noexcept nogil:
+        cdef int i
+        cdef bint fresh
+        if not fabs(speed) <= self.still_wheel:
+            return False
+        for i in range(self.sources):
+            if self.models[i] == GNSS_VELOCITY:
+                fresh = self.stamps[T] - self.source_stamps[i * SOURCE_STAMPS_SIZE + T_LAST] <= GNSS_FRESH_NS
+                if fresh and self.memory[i * MEMORY_SIZE + LAST_VALUE] > CARRIED and is_trusted(self.memory + i * MEMORY_SIZE):
+                    return True
+        return False
+
+    cdef bint is_carried(self) noexcept nogil:
+        cdef int i
+        cdef bint fresh = False
+        for i in range(self.sources):
+            if self.models[i] == WHEEL_SPEED:
+                if self.stamps[T] - self.source_stamps[i * SOURCE_STAMPS_SIZE + T_LAST] <= WHEEL_FRESH_NS:
+                    fresh = True
+                    if not self.carried(self.memory[i * MEMORY_SIZE + LAST_VALUE]):
+                        return False
+        return fresh
 
     cdef void constrain(self) noexcept nogil:
         cdef int64_t now = self.stamps[T]
@@ -1291,7 +1517,7 @@ cdef class Kernel:
                     seen.variance[i] = self.constraints[2, 0]
                 self.apply(2, &seen, 1.0)
                 return
-        if self.non_holonomic:
+        if self.non_holonomic and not self.is_carried():
             parameter = &self.constraints[0, 0]
             point_velocity(self.x, self.auxiliary, parameter, 1, 3, v, by)
             if fabs(v[0]) < parameter[5]:
@@ -1304,25 +1530,52 @@ cdef class Kernel:
             self.apply(0, &seen, 1.0)
 
     cdef bint apply(self, int which, Observation* seen, double factor) noexcept nogil:
-        cdef double ratio = update(self.x, self.p, seen, self.gates[seen.m], factor, NULL)
-        self.auxiliary[CONSTRAINT_RATIO + which] = ratio
-        self.stamps[(CONSTRAINT_FUSED if ratio <= 1 else CONSTRAINT_REJECTED) + which] += 1
-        return ratio <= 1
+        cdef double across[3][n]
+        cdef double s[3][3]
+        cdef Update done
+        project(self.p, seen, across, s)
+        done = update(self.x, self.p, seen, self.gates[seen.m], factor, True, 0.0, across, s)
+        self.auxiliary[CONSTRAINT_RATIO + which] = done.ratio
+        self.stamps[(CONSTRAINT_FUSED if done.fused else CONSTRAINT_REJECTED) + which] += 1
+        return done.fused
 
     cdef void measure(self, Row* row) noexcept nogil:
-        cdef int model = self.models[row.source], a
+        cdef int model = self.models[row.source], a, companion
         cdef double* parameter = &self.parameters[row.source, 0]
         cdef double* memory = self.memory + row.source * MEMORY_SIZE
         cdef int64_t* stamps = self.source_stamps + row.source * SOURCE_STAMPS_SIZE
         cdef Observation seen
-        cdef double factor = 1.0, interval, alike, ratio, correlation
+        cdef Update done
+        cdef double across[3][n]
+        cdef double s[3][3]
+        cdef double given[3]
+        cdef double learnt[3]
+        cdef double whitened[3]
+        cdef double factor = 1.0, interval, alike, correlation, elapsed = 0.0, share
+        cdef int64_t pause
+        cdef bint same, trusted
+        same = arrive(memory, stamps, row)
+        if stamps[T_LAST] != NEVER:
+            elapsed = (row.t_ns - stamps[T_LAST]) * 1e-9
         if model == WHEEL_SPEED:
             memory[LAST_VALUE] = row.values[0]
             wheel(self.x, self.p, self.auxiliary, row.values, parameter, &seen)
         elif model == GNSS_POSITION:
             gnss_position(self.x, self.auxiliary, row.values, parameter, &seen)
         else:
+            memory[LAST_VALUE] = sqrt(row.values[0] * row.values[0] + row.values[1] * row.values[1]) - 3 * sqrt(row.values[3])
             gnss_velocity(self.x, self.auxiliary, row.values, parameter, &seen)
+        project(self.p, &seen, across, s)
+        share = 1 + memory[NOISE_EXCESS]
+        if share < parameter[NOISE_LEAST]:
+            share = parameter[NOISE_LEAST]
+        if share > parameter[NOISE_MOST]:
+            share = parameter[NOISE_MOST]
+        for a in range(seen.m):
+            given[a] = seen.variance[a] * parameter[SHARED]
+            learnt[a] = given[a] * share
+            row.innovation[a] = seen.innovation[a]
+            row.variance[a] = s[a][a] + learnt[a]
         correlation = row.values[2] if model == WHEEL_SPEED else parameter[3]
         if correlation > 0 and stamps[T_FUSED] != NEVER:
             interval = (row.t_ns - stamps[T_FUSED]) * 1e-9
@@ -1330,24 +1583,51 @@ cdef class Kernel:
                 interval = 1e-6
             alike = exponential(-interval / correlation)
             factor = (1 + alike) / (1 - alike)
+        pause = <int64_t>(2e9 * correlation)
+        if stamps[T_JUDGED] == NEVER or row.t_ns - stamps[T_JUDGED] >= (pause if pause > JUDGE_NS else JUDGE_NS):
+            if whiten(s, &seen, learnt, whitened):
+                judge(memory, stamps, whitened, seen.m, same, row.t_ns)
+        learn(memory, &seen, given, s, elapsed)
+        companion = <int>parameter[COMPANION]
+        trusted = is_trusted(memory) and (companion < 0 or is_trusted(self.memory + companion * MEMORY_SIZE))
+        if model == WHEEL_SPEED and trusted:
+            trusted = not self.carried(memory[LAST_VALUE])
         for a in range(seen.m):
-            row.innovation[a] = seen.innovation[a]
-        ratio = update(self.x, self.p, &seen, self.gates[seen.m], factor, row.variance)
-        row.ratio = ratio
-        memory[LAST_RATIO] = ratio
-        if not ratio <= 1 and model != WHEEL_SPEED and stamps[T_REJECTED] != NEVER \
-                and row.t_ns - stamps[T_REJECTED] >= self.gnss_reset:
-            self.reset_block(&seen, POSITION if model == GNSS_POSITION else VELOCITY)
-            ratio = 1.0
-        if ratio <= 1:
-            stamps[T_FUSED] = row.t_ns
+            seen.variance[a] = learnt[a]
+            if memory[NOISY] > NOTED:
+                seen.variance[a] *= 1 + (NOISY_VARIANCE - 1) * memory[NOISY]
+        done = update(self.x, self.p, &seen, self.gates[seen.m], factor, trusted, parameter[CLUTTER], across, s)
+        row.ratio = done.ratio
+        memory[LAST_RATIO] = done.ratio
+        if done.fused:
             stamps[T_REJECTED] = NEVER
+            stamps[T_ALIKE] = NEVER
+        elif model != WHEEL_SPEED and self.locked_out(row, memory, stamps, companion, &seen):
+            self.reset_block(&seen, POSITION if model == GNSS_POSITION else VELOCITY)
+            begin_health(memory)
+            done.fused = True
+        if done.fused:
+            stamps[T_FUSED] = row.t_ns
             if model == GNSS_POSITION:
                 self.stamps[T_POSITION] = row.t_ns
         else:
             row.outcome = REJECTED
             if stamps[T_REJECTED] == NEVER:
                 stamps[T_REJECTED] = row.t_ns
+
+    cdef bint locked_out(self, Row* row, double* memory, int64_t* stamps, int companion, Observation* seen) noexcept nogil:
+        """fusiond.kernel._locked_out"""
+        cdef bint off = moved(memory, seen, self.gates[seen.m])
+        cdef int64_t wait = self.gnss_reset
+        if off or stamps[T_ALIKE] == NEVER or row.t_ns - stamps[T_LAST] > BREAK_NS:
+            stamps[T_ALIKE] = row.t_ns
+            return False
+        if companion >= 0 and not is_trusted(self.memory + companion * MEMORY_SIZE):
+            wait = SUSPECT * wait
+        elif stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS:
+            if memory[LAST_RATIO] <= NEAR:
+                wait = self.gnss_return
+        return row.t_ns - stamps[T_ALIKE] >= wait
 
     cdef void reset_block(self, Observation* seen, int block) noexcept nogil:
         cdef double to_n[9]

@@ -35,7 +35,8 @@ class Filter(Section, frozen=True, kw_only=True):
     imu_gap_s: Seconds = 0.2  # an IMU silent for longer is bridged by coasting at constant velocity
     restart_gap_s: Seconds = 30.0  # after a hole in the data of this length the filter aligns anew
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
-    gnss_reset_s: Seconds = 10.0  # GNSS rejected for this long without a break is believed again
+    gnss_reset_s: Seconds = 30.0  # GNSS that was rejected for this long, off alike all the time, is believed again
+    gnss_return_s: Seconds = 3.0  # the same where no fix was fused for 10 s before
     v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # given start heading, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
@@ -131,6 +132,12 @@ class Gnss(Section, frozen=True, kw_only=True):
     position_correlation_s: NotNegative = 0.0  # time over which position errors stay alike: weighs dense fixes down
     velocity_correlation_s: NotNegative = 0.0  # likewise, velocity
     use_velocity: bool = True  # fuse speed and course as well
+    outliers: Literal["gate", "mixture"] = "gate"  # leave them out, or weigh each fix by how likely it is one
+    outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, where outliers = "mixture"
+    noise_least: Positive = 1.0  # the sigmas are learnt from the innovations, down to this multiple of the given ones
+    noise_most: Positive = 3.0  # and up to this
+    group: Name | None = None  # receivers of one group share part of their error: atmosphere, multipath
+    shared_sigma_m: NotNegative = 0.0  # that part of the position's error
     minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # GPS_FIX_TYPE that a fix must have at least; 3: 3-D
     interval_s: Positive = 0.2  # expected spacing of fixes
 
@@ -153,6 +160,10 @@ class Wheel(Section, frozen=True, kw_only=True):
     position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
     steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
     sigma_mps: Positive = 0.1  # white noise of one reading
+    noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_mps
+    noise_most: Positive = 3.0  # and up to this
+    group: Name | None = None  # wheels of one group share part of their error: tyres, one axle's slip
+    shared_sigma_mps: NotNegative = 0.0  # that part of it
     least_mps: NotNegative = 0.1  # slower than this it reads 0, or anything
     quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
     correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
@@ -274,17 +285,24 @@ def _contradictions(config: Config) -> list[tuple[str, str]]:
             if name in taken:
                 found.append((f"{table}.{name}", f"[{taken[name]}.{name}] has this name; each source needs its own"))
             taken.setdefault(name, table)
-    learnt = [name for name, gnss in config.gnss.items() if calibrated(gnss)]
-    if len(learnt) > 1:
-        found.append((f"gnss.{learnt[1]}", f"the lever arm and delays of one receiver can be learnt: [gnss.{learnt[0]}]"))
-    groups = wheel_groups(config)
-    if len(set(groups.values())) > MOST_SCALES:
-        found.append(("filter.wheel_scale_by", f"at most {MOST_SCALES} scales, '{config.filter.wheel_scale_by}' makes more"))
+    found += _contradictions_of_learning(config)
     if config.record.file_mb * 2 > config.record.total_mb:
         found.append(("record.total_mb", f"must be at least twice file_mb ({config.record.file_mb:g} MB)"))
     if config.filter.imu_gap_s >= config.filter.horizon_s:
         found.append(("filter.imu_gap_s", f"must be below horizon_s ({config.filter.horizon_s} s)"))
     return found
+
+
+def _contradictions_of_learning(config: Config) -> Iterator[tuple[str, str]]:
+    for table, named in (("gnss", config.gnss), ("wheel", config.wheel)):
+        for name, source in named.items():
+            if source.noise_least > source.noise_most:
+                yield f"{table}.{name}.noise_least", f"must not exceed noise_most ({source.noise_most:g})"
+    learnt = [name for name, gnss in config.gnss.items() if calibrated(gnss)]
+    if len(learnt) > 1:
+        yield f"gnss.{learnt[1]}", f"the lever arm and delays of one receiver can be learnt: [gnss.{learnt[0]}]"
+    if len(set(wheel_groups(config).values())) > MOST_SCALES:
+        yield "filter.wheel_scale_by", f"at most {MOST_SCALES} scales, '{config.filter.wheel_scale_by}' makes more"
 
 
 def _contradictions_on_can(config: Config) -> Iterator[tuple[str, str]]:

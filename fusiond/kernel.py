@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond import alignment
+from fusiond import alignment, health
 from fusiond.earth import Array, mat_ne
-from fusiond.motion import constrain, watch
-from fusiond.observe import MODELS, wheel_speed
-from fusiond.observe.model import CORRELATION, VALUES, Observation
+from fusiond.motion import carried, constrain, watch
+from fusiond.observe import MODELS, gnss_velocity, wheel_speed
+from fusiond.observe.model import CLUTTER, COMPANION, CORRELATION, NOISE_LEAST, NOISE_MOST, SHARED, VALUES, Observation
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
@@ -40,6 +40,7 @@ from fusiond.state import (
     RATE_B,
     RESETS,
     RUNNING,
+    T_ALIKE,
     T_FUSED,
     T_IMU,
     T_LAST,
@@ -52,7 +53,7 @@ from fusiond.state import (
     T,
 )
 from fusiond.strapdown import coast, propagate
-from fusiond.update import correlation_factor, update
+from fusiond.update import correlation_factor, update, whiten
 
 
 class Outcome(IntEnum):
@@ -82,6 +83,11 @@ ROW = np.dtype(
     ]
 )
 Rows = NDArray[Any]  # structured, of dtype ROW
+
+BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
+OUTAGE_NS = 10_000_000_000  # a source not fused for longer before it was rejected comes back from an outage
+SUSPECT = 6  # times gnss_reset_s, where the receiver's velocity is not trusted
+NEAR = 9.0  # test ratio up to which a fix after an outage is believed soon
 
 
 class Kernel:
@@ -289,7 +295,8 @@ def advance(state: FilterState, t_ns: int, imu: Any | None, plan: Plan) -> None:
     dt = (t_ns - begin) * 1e-9
     held = int(stamps[T_IMU])
     stamps[T] = t_ns
-    if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns:
+    frozen = not health.is_trusted(state.memory[plan.imu_source])
+    if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns or frozen:
         coast(state, dt, plan.noise)
         return
     span = float(imu["t_ns"] - held)
@@ -311,6 +318,8 @@ def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
     if t_ns <= begin or stamps[PHASE] != RUNNING:
         return
     carried = max(begin, min(t_ns, int(stamps[T_IMU]) + plan.imu_gap_ns))
+    if not health.is_trusted(state.memory[plan.imu_source]):
+        carried = begin
     if carried > begin:
         propagate(state, (carried - begin) * 1e-9, auxiliary[HELD_FORCE_B], auxiliary[HELD_RATE_B], plan.noise)
     if t_ns > carried:
@@ -322,6 +331,9 @@ def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
     """Make an IMU sample the held one; let it tell of standstill; apply the constraints that are due."""
     stamps, auxiliary = state.stamps, state.auxiliary
     dt = (t_ns - int(stamps[T_IMU])) * 1e-9 if stamps[T_IMU] != NEVER else 0.0
+    memory, own = state.memory[plan.imu_source], state.source_stamps[plan.imu_source]
+    same, _ = health.arrive(memory, own, values, t_ns)
+    health.judge_repetition(memory, own, same, t_ns)
     stamps[T_IMU] = t_ns
     auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = values[0:3]
     auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = values[3:6]
@@ -332,25 +344,43 @@ def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
 def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     """Judge and fuse one measurement at the state's own instant."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
-    model = plan.models[source]
+    model, values = plan.models[source], row["values"]
     parameters, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
+    same, elapsed = health.arrive(memory, stamps, values, t_ns)
     if model == MODEL["wheel_speed"]:
-        memory[LAST_VALUE] = row["values"][0]
-    seen = MODELS[model].observe(state, row["values"], parameters)
+        memory[LAST_VALUE] = values[wheel_speed.SPEED]
+    elif model == MODEL["gnss_velocity"]:
+        memory[LAST_VALUE] = gnss_velocity.least_speed(values)
+    seen = MODELS[model].observe(state, values, parameters)
     assert seen is not None, "a source's model always observes"
-    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
-    correlation = row["values"][wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION]
-    factor = correlation_factor(interval, correlation)
     m = len(seen.innovation)
-    row["innovation"][:m] = seen.innovation
-    row["variance"][:m] = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian) + seen.variance
-    ratio, fused = update(state, seen, plan.gates[m], factor)
-    if not fused and _locked_out(stamps, t_ns, model, plan):
-        _reset_block(state, seen, model)
-        fused = True
+    predicted = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian)
+    given = seen.variance * parameters[SHARED]
+    learnt = given * health.noise_factor(memory, parameters[NOISE_LEAST], parameters[NOISE_MOST])
+    row["innovation"][:m], row["variance"][:m] = seen.innovation, predicted + learnt
+    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
+    correlation = values[wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION]
+    if health.is_due(stamps, t_ns, correlation):
+        whitened = whiten(state, seen._replace(variance=learnt))
+        if whitened is not None:
+            health.judge(memory, stamps, health.Judgement(whitened, same, t_ns))
+    health.learn(memory, (seen.innovation, given), predicted, elapsed)
+    companion = int(parameters[COMPANION])
+    trusted = health.is_trusted(memory) and (companion < 0 or health.is_trusted(state.memory[companion]))
+    trusted = trusted and not (model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan))
+    seen = seen._replace(variance=learnt * health.noisy_factor(memory))
+    ratio, fused = update(
+        state, seen, plan.gates[m], correlation_factor(interval, correlation), trusted, float(parameters[CLUTTER])
+    )
     row["ratio"] = memory[LAST_RATIO] = ratio
     if fused:
-        stamps[T_FUSED], stamps[T_REJECTED] = t_ns, NEVER
+        stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
+    elif model != MODEL["wheel_speed"] and _locked_out(state, source, seen, t_ns, plan):
+        _reset_block(state, seen, model)
+        health.begin(memory)
+        fused = True
+    if fused:
+        stamps[T_FUSED] = t_ns
         if model == MODEL["gnss_position"]:
             state.stamps[T_POSITION] = t_ns
         return
@@ -359,10 +389,23 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
         stamps[T_REJECTED] = t_ns
 
 
-def _locked_out(stamps: NDArray[np.int64], t_ns: int, model: int, plan: Plan) -> bool:
-    """Whether a GNSS source has been rejected without a break for so long that the state is the more likely culprit."""
-    gnss = model in (MODEL["gnss_position"], MODEL["gnss_velocity"])
-    return gnss and stamps[T_REJECTED] != NEVER and t_ns - int(stamps[T_REJECTED]) >= plan.gnss_reset_ns
+def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, plan: Plan) -> bool:
+    """Whether a GNSS source has been rejected for so long, off alike all the time, that the state is the more likely
+    culprit: soon after an outage, later otherwise, and much later while the receiver contradicts itself."""
+    memory, stamps = state.memory[source], state.source_stamps[source]
+    gate = plan.gates[len(seen.innovation)]
+    off = health.moved(memory, seen.innovation, seen.variance, gate)
+    if off or stamps[T_ALIKE] == NEVER or t_ns - int(stamps[T_LAST]) > BREAK_NS:
+        stamps[T_ALIKE] = t_ns
+        return False
+    wait = plan.gnss_reset_ns
+    companion = int(plan.parameters[source, COMPANION])
+    if companion >= 0 and not health.is_trusted(state.memory[companion]):
+        wait = SUSPECT * wait
+    elif stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS:
+        near = memory[LAST_RATIO] <= NEAR
+        wait = plan.gnss_return_ns if near else wait
+    return t_ns - int(stamps[T_ALIKE]) >= wait
 
 
 def _reset_block(state: FilterState, seen: Observation, model: int) -> None:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from fusiond.config import Config, Filter, Imu, Motion, calibrated, wheel_groups
+from fusiond.config import Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
 from fusiond.earth import Array
 from fusiond.elementary import square
 from fusiond.observe import CONSTRAINTS, MODELS, wheel_speed
-from fusiond.observe.model import PARAMETERS
+from fusiond.observe.model import CLUTTER, COMPANION, NOISE_LEAST, NOISE_MOST, PARAMETERS, SHARED
 from fusiond.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
@@ -46,12 +46,15 @@ class Plan:
     noise: ProcessNoise
     size: int  # of the error state
     calibration_variances: Array  # (size - CALIBRATIONS,): first ones
+    imu_source: int
     wheels: tuple[int, ...]  # indices of the sources that are wheels
+    velocities: tuple[int, ...]  # and of those that are GNSS velocities
     horizon_ns: int
     snapshot_interval_ns: int
     imu_gap_ns: int
     restart_gap_ns: int
     gnss_reset_ns: int
+    gnss_return_ns: int
     constraint_interval_ns: int
     still_after_ns: int
     still_gyro: float  # rad/s
@@ -77,14 +80,7 @@ def plan(config: Config) -> Plan:
             found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
     sources = tuple(sorted(found))
     models = tuple(found[source] for source in sources)
-    rows = [
-        np.zeros(PARAMETERS) if model == IMU else MODELS[model].parameters(section_of(source, model, config))
-        for source, model in zip(sources, models, strict=True)
-    ]
-    groups = wheel_groups(config)
-    for row, source, model in zip(rows, sources, models, strict=True):
-        if model == MODEL["wheel_speed"]:
-            row[wheel_speed.SCALE_STATE] = _scale_state(groups[source])
+    rows = [_parameters(source, sources, model, config) for source, model in zip(sources, models, strict=True)]
     first, walks = _calibrations(config)
     (imu,) = config.imu.values()
     motion, settings = config.motion, config.filter
@@ -103,12 +99,15 @@ def plan(config: Config) -> Plan:
         ),
         size=CALIBRATIONS + len(first),
         calibration_variances=first,
+        imu_source=models.index(IMU),
         wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
+        velocities=tuple(i for i, model in enumerate(models) if model == MODEL["gnss_velocity"]),
         horizon_ns=nanoseconds(settings.horizon_s),
         snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
         imu_gap_ns=nanoseconds(settings.imu_gap_s),
         restart_gap_ns=nanoseconds(settings.restart_gap_s),
         gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
+        gnss_return_ns=nanoseconds(min(settings.gnss_return_s, settings.gnss_reset_s)),
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),
         still_gyro=math.radians(motion.still_gyro_deg_s),
@@ -117,6 +116,36 @@ def plan(config: Config) -> Plan:
         motion=motion,
         imu=imu,
     )
+
+
+def _parameters(source: str, sources: tuple[str, ...], model: int, config: Config) -> Array:
+    """The row of one source: what its model wants, and what all have."""
+    if model == IMU:
+        return np.zeros(PARAMETERS)
+    section = section_of(source, model, config)
+    row = MODELS[model].parameters(section)
+    row[NOISE_LEAST], row[NOISE_MOST] = square(section.noise_least), square(section.noise_most)
+    row[SHARED], row[COMPANION] = _shared(section, model, config), -1
+    if model == MODEL["wheel_speed"]:
+        row[wheel_speed.SCALE_STATE] = _scale_state(wheel_groups(config)[source])
+        return row
+    row[CLUTTER] = section.outlier_share if section.outliers == "mixture" else 0.0
+    velocity = source.removesuffix(".position") + ".velocity"
+    if model == MODEL["gnss_position"] and velocity in sources:
+        row[COMPANION] = sources.index(velocity)
+    return row
+
+
+def _shared(section: Gnss | Wheel, model: int, config: Config) -> float:
+    """By what each variance s_i^2 of a group grows so that all of them, fused one by one, are worth no more than their
+    shared error s_c allows (THEORY A5): with 1 + s_c^2 sum 1 / s_j^2 they are worth s_c^2 + 1 / sum 1 / s_j^2 together."""
+    if section.group is None or model == MODEL["gnss_velocity"]:
+        return 1.0
+    if isinstance(section, Wheel):
+        sigmas = [wheel.sigma_mps for wheel in config.wheel.values() if wheel.group == section.group]
+        return 1 + square(section.shared_sigma_mps) * sum(1 / square(sigma) for sigma in sigmas)
+    sigmas = [gnss.position_sigma_m for gnss in config.gnss.values() if gnss.group == section.group]
+    return 1 + square(section.shared_sigma_m) * sum(1 / square(sigma) for sigma in sigmas)
 
 
 def _scale_state(group: int) -> int:

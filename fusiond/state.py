@@ -63,9 +63,18 @@ CONSTRAINT_RATIO = slice(32, 35)  # last test ratios: non-holonomic, zero veloci
 AUXILIARY_SIZE = 35
 
 # Remembered of each source: columns of FilterState.memory
-LAST_VALUE = 0  # last reading, wheels only [m/s]
+LAST_VALUE = 0  # last reading of a wheel [m/s]; of a GNSS velocity, the least horizontal speed that it leaves possible
 LAST_RATIO = 1  # test ratio of the last update
-MEMORY_SIZE = 2
+NOISE_EXCESS = 2  # learnt variance over the configured one, less 1
+BELIEF = slice(3, 7)  # probabilities (fusiond.health); all 0 before the first look
+NOMINAL, NOISY, BIASED, FROZEN = 3, 4, 5, 6
+BIAS = slice(7, 10)  # whitened innovation that a biased source would have
+BIAS_VARIANCE = 10
+LAST_SUM = 11  # of the last reading's numbers: tells a repeated one
+INTERVAL = 12  # s, mean spacing of the events
+LAST_INNOVATION = slice(13, 16)  # of the last rejection
+MEAN_NIS = 16  # normalised innovation squared per axis, mean
+MEMORY_SIZE = 17
 
 # Stamps and counts: indices of FilterState.stamps
 T = 0  # ns, instant of the state
@@ -88,7 +97,9 @@ STAMPS_SIZE = 18
 T_LAST = 0  # ns, of its last event
 T_FUSED = 1  # ns, of its last event fused
 T_REJECTED = 2  # ns, of the first of an unbroken row of rejections; NEVER if there is none
-SOURCE_STAMPS_SIZE = 3
+T_JUDGED = 3  # ns, of the last look at its health
+T_ALIKE = 4  # ns, since when its rejected readings are off alike; NEVER if there is none
+SOURCE_STAMPS_SIZE = 5
 
 EMPTY, ALIGNING, RUNNING = 0, 1, 2
 NEVER = -(2**62)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusiond.config import Gnss, calibrated
@@ -57,6 +59,11 @@ def values(velocity: GnssVelocity, gnss: Gnss) -> tuple[float, ...]:
     if velocity.down is None:
         return velocity.north, velocity.east, 0.0, variance, 2.0
     return velocity.north, velocity.east, velocity.down, variance, 3.0
+
+
+def least_speed(row: Array) -> float:
+    """The least horizontal speed [m/s] that a reading leaves possible: three sigmas below it."""
+    return math.sqrt(row[0] * row[0] + row[1] * row[1]) - 3 * math.sqrt(row[VARIANCE])
 
 
 def observe(state: FilterState, row: Array, parameter: Array) -> Observation:

@@ -37,6 +37,7 @@ from fusiond.state import (
     RUNNING,
     SCATTER_FORCE,
     SCATTER_RATE,
+    T_ALIKE,
     T_IMU,
     T_LAST,
     T_REJECTED,
@@ -245,8 +246,11 @@ def test_reset_after_a_long_rejection(kind: str) -> None:
         "velocity": GnssVelocity(90.0, -90.0, 9.0),
         "velocity 2-D": GnssVelocity(90.0, -90.0),
     }[kind]
+    first, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
+    state.memory[source] = first.history.head.memory[source]  # its innovation; it will be off by as much again
+    state.source_stamps[source, [T_LAST, T_REJECTED]] = T0 - 100 * MS
     for since, resets in ((5 * SECOND, 1), (5 * SECOND - 1, 0), (None, 0)):
-        state.source_stamps[source, T_REJECTED] = NEVER if since is None else T0 - since
+        state.source_stamps[source, T_ALIKE] = NEVER if since is None else T0 - since
         fusion, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
         assert fusion.history.head.stamps[RESETS] == resets
         assert fusion.history.rows[0]["outcome"] == (Outcome.FUSED if resets else Outcome.REJECTED)
