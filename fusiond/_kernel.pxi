@@ -9,7 +9,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memmove, memset
 
 from fusiond import state as layout
-from fusiond import alignment, health, kernel, motion, observe, strapdown, update as updates
+from fusiond import alignment, bank, health, kernel, motion, observe, strapdown, update as updates
 from fusiond.earth import GRAVITY_RATIO as _GRAVITY_RATIO
 from fusiond.kernel import Outcome
 from fusiond.observe import wheel_speed
@@ -107,9 +107,13 @@ cdef enum:
     T_REJECTED = 2
     T_JUDGED = 3
     T_ALIKE = 4
-    SOURCE_STAMPS_SIZE = 5
+    T_BACK = 5
+    SOURCE_STAMPS_SIZE = 6
     ALIGNING = 1
     RUNNING = 2
+    CHOOSING = 3
+    HYPOTHESES = 13
+    BLOCK = 1 + NOMINAL_SIZE + n * n  # numbers of a hypothesis: weight, nominal, covariance
     FUSED = 0
     REJECTED = 1
     DUPLICATE = 3
@@ -159,14 +163,18 @@ cdef double KEEPS = health.KEEPS
 cdef double PRIOR[4]
 PRIOR[:] = health.PRIOR
 cdef double OUTLIERS = health.OUTLIERS
+cdef double LEAST_WEIGHT = bank.LEAST_WEIGHT
+cdef double BANK_CLUTTER = bank.CLUTTER
 cdef double OUTLIER_VARIANCE = health.OUTLIER_VARIANCE
 cdef double NOISY_VARIANCE = health.NOISY_VARIANCE
 cdef double FIRST_BIAS_VARIANCE = health.FIRST_BIAS_VARIANCE
 cdef double BIAS_WALK = health.BIAS_WALK
 cdef double FARTHEST = health.FARTHEST
 cdef double LEAST_BIAS = health.LEAST_BIAS
-cdef double SAME_IF_NOT_FROZEN = health.SAME_IF_NOT_FROZEN
+cdef double SAME_IF_NOMINAL = health.SAME_IF_NOMINAL
+cdef double SAME_IF_FAULTY = health.SAME_IF_FAULTY
 cdef double OTHER_IF_FROZEN = health.OTHER_IF_FROZEN
+cdef double TELLING = health.TELLING
 cdef double NOTED = health.NOTED
 cdef double DISTRUST = health.DISTRUST
 cdef double NOISE_TIME = health.NOISE_TIME
@@ -194,11 +202,11 @@ def check_layout():
         ("MEAN_WEIGHT", MEAN_WEIGHT), ("AUXILIARY_SIZE", AUXILIARY_SIZE), ("LAST_VALUE", LAST_VALUE),
         ("LAST_RATIO", LAST_RATIO), ("NOISE_EXCESS", NOISE_EXCESS), ("NOMINAL", NOMINAL), ("NOISY", NOISY),
         ("BIASED", BIASED), ("FROZEN", FROZEN), ("BIAS_VARIANCE", BIAS_VARIANCE), ("LAST_SUM", LAST_SUM),
-        ("INTERVAL", INTERVAL), ("MEAN_NIS", MEAN_NIS), ("T_JUDGED", T_JUDGED), ("T_ALIKE", T_ALIKE), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
+        ("INTERVAL", INTERVAL), ("MEAN_NIS", MEAN_NIS), ("T_JUDGED", T_JUDGED), ("T_ALIKE", T_ALIKE), ("T_BACK", T_BACK), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
         ("T_CONSTRAINT", T_CONSTRAINT), ("T_STILL", T_STILL), ("T_POSITION", T_POSITION),
         ("T_FIRST_VELOCITY", T_FIRST_VELOCITY), ("T_REST", T_REST), ("ALIGNING", ALIGNING), ("PHASE", PHASE),
         ("RESETS", RESETS), ("BLOWN", BLOWN), ("STAMPS_SIZE", STAMPS_SIZE), ("T_LAST", T_LAST), ("T_FUSED", T_FUSED),
-        ("T_REJECTED", T_REJECTED), ("SOURCE_STAMPS_SIZE", SOURCE_STAMPS_SIZE), ("RUNNING", RUNNING), ("NEVER", NEVER),
+        ("T_REJECTED", T_REJECTED), ("SOURCE_STAMPS_SIZE", SOURCE_STAMPS_SIZE), ("RUNNING", RUNNING), ("CHOOSING", CHOOSING), ("HYPOTHESES", HYPOTHESES), ("NEVER", NEVER),
     ):
         assert getattr(layout, name) == number, name
     assert [model.name for model in observe.MODELS[:COMPILED]] == ["gnss_position", "gnss_velocity", "wheel_speed"]
@@ -769,7 +777,8 @@ cdef void point_velocity(double* x, double* auxiliary, double* point, int first,
             jacobian[i * n + MOUNT_ERROR + k] = by[2 * i + k]
 
 
-cdef void wheel(double* x, double* p, double* auxiliary, double* row, double* parameter, Observation* seen) noexcept nogil:
+cdef void wheel(double* x, double* p, double* auxiliary, double* row, double* parameter, Observation* seen,
+                bint certain) noexcept nogil:
     cdef double v[3]
     cdef double by[3 * n]
     cdef int which = <int>parameter[6]
@@ -792,7 +801,7 @@ cdef void wheel(double* x, double* p, double* auxiliary, double* row, double* pa
             seen.jacobian[j] = scale * by[j]
     seen.jacobian[which] = speed
     if parameter[5] != 0.0 and reading > 0:
-        if fabs(speed) > SURE_SPEED:
+        if certain or fabs(speed) > SURE_SPEED:
             if speed < 0:
                 reading = -reading
         else:
@@ -835,6 +844,43 @@ cdef bint cholesky(double s[3][3], double* variance, double factor, int m, doubl
             else:
                 low[i][j] = rest / low[j][j]
     return True
+
+
+cdef void inject(double* x, double* error) noexcept nogil:
+    cdef double part[4]
+    cdef double turned[4]
+    cdef int i
+    for i in range(3):
+        x[POSITION_E + i] += error[POSITION + i]
+        x[VELOCITY_E + i] += error[VELOCITY + i]
+        x[GYRO_BIAS_B + i] += error[GYRO_BIAS + i]
+        x[ACCEL_BIAS_B + i] += error[ACCEL_BIAS + i]
+    for i in range(CALIBRATIONS, n):
+        x[i + 1] += error[i]
+    quaternion_exp(error + ATTITUDE, part)
+    quaternion_multiply(part, x + QUATERNION_EB, turned)
+    normalise(turned)
+    memcpy(x + QUATERNION_EB, turned, 4 * sizeof(double))
+
+
+cdef void difference(double* a, double* b, double* error) noexcept nogil:
+    """fusiond.bank.difference"""
+    cdef double back[4]
+    cdef double turn[4]
+    cdef int i
+    for i in range(3):
+        error[POSITION + i] = a[POSITION_E + i] - b[POSITION_E + i]
+        error[VELOCITY + i] = a[VELOCITY_E + i] - b[VELOCITY_E + i]
+        error[GYRO_BIAS + i] = a[GYRO_BIAS_B + i] - b[GYRO_BIAS_B + i]
+        error[ACCEL_BIAS + i] = a[ACCEL_BIAS_B + i] - b[ACCEL_BIAS_B + i]
+    for i in range(CALIBRATIONS, n):
+        error[i] = a[i + 1] - b[i + 1]
+    back[0] = b[QUATERNION_EB]
+    for i in range(1, 4):
+        back[i] = -b[QUATERNION_EB + i]
+    quaternion_multiply(a + QUATERNION_EB, back, turn)
+    for i in range(3):
+        error[ATTITUDE + i] = turn[1 + i] * (2.0 if turn[0] >= 0 else -2.0)
 
 
 cdef struct Update:
@@ -893,8 +939,6 @@ cdef Update update(double* x, double* p, Observation* seen, double gate, double 
     cdef double low[3][3]
     cdef double solved[3]
     cdef double error[n]
-    cdef double part[4]
-    cdef double turned[4]
     cdef double before[n * n]
     cdef double distance = 0.0, h, share = 1.0, mixed
     cdef int i, j, k, a, m = seen.m
@@ -954,17 +998,7 @@ cdef Update update(double* x, double* p, Observation* seen, double gate, double 
                 p[i * n + j] = share * p[i * n + j] + (1 - share) * before[i * n + j] + mixed * (error[i] * error[j])
         for i in range(n):
             error[i] = share * error[i]
-    for i in range(3):
-        x[POSITION_E + i] += error[POSITION + i]
-        x[VELOCITY_E + i] += error[VELOCITY + i]
-        x[GYRO_BIAS_B + i] += error[GYRO_BIAS + i]
-        x[ACCEL_BIAS_B + i] += error[ACCEL_BIAS + i]
-    for i in range(CALIBRATIONS, n):
-        x[i + 1] += error[i]
-    quaternion_exp(error + ATTITUDE, part)
-    quaternion_multiply(part, x + QUATERNION_EB, turned)
-    normalise(turned)
-    memcpy(x + QUATERNION_EB, turned, 4 * sizeof(double))
+    inject(x, error)
     result.fused = share >= 0.5
     return result
 
@@ -999,6 +1033,15 @@ cdef void judge(double* memory, int64_t* stamps, double* whitened, int m, bint s
         elapsed = (t_ns - stamps[T_JUDGED]) * 1e-9
     stamps[T_JUDGED] = t_ns
     blurred = 1 - exponential(-elapsed / KEEPS)
+    for i in range(m):
+        square += whitened[i] * whitened[i]
+        rest = whitened[i] - memory[BIAS + i]
+        off += rest * rest
+    if density(square, 1 + FIRST_BIAS_VARIANCE, m) > density(off, 1 + memory[BIAS_VARIANCE], m):
+        for i in range(3):
+            memory[BIAS + i] = 0.0
+        memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
+    off = 0.0
     if memory[BIAS_VARIANCE] < 1.0:
         for i in range(m):
             size += memory[BIAS + i] * memory[BIAS + i]
@@ -1006,14 +1049,13 @@ cdef void judge(double* memory, int64_t* stamps, double* whitened, int m, bint s
         if 1e-9 < size < LEAST_BIAS:
             stretch = LEAST_BIAS / size
     for i in range(m):
-        square += whitened[i] * whitened[i]
         rest = whitened[i] - memory[BIAS + i] * stretch
         off += rest * rest
     if square > FARTHEST:
         square = FARTHEST
     outlier = density(square, OUTLIER_VARIANCE, m)
-    alike = SAME_IF_NOT_FROZEN if same else 1.0
-    likelihood[0] = ((1 - OUTLIERS) * density(square, 1.0, m) + OUTLIERS * outlier) * alike
+    likelihood[0] = ((1 - OUTLIERS) * density(square, 1.0, m) + OUTLIERS * outlier) * (SAME_IF_NOMINAL if same else 1.0)
+    alike = SAME_IF_FAULTY if same else 1.0
     likelihood[1] = ((1 - OUTLIERS) * density(square, NOISY_VARIANCE, m) + OUTLIERS * outlier) * alike
     likelihood[2] = ((1 - OUTLIERS) * density(off, 1 + memory[BIAS_VARIANCE], m) + OUTLIERS * outlier) * alike
     likelihood[3] = outlier * (1.0 if same else OTHER_IF_FROZEN)
@@ -1038,6 +1080,15 @@ cdef bint arrive(double* memory, int64_t* stamps, Row* row) noexcept nogil:
         share = INTERVAL_SHARE if memory[INTERVAL] > 0 else 1.0
         memory[INTERVAL] += share * ((elapsed if elapsed < 10.0 else 10.0) - memory[INTERVAL])
     return same
+
+
+cdef bint tells(double s[3][3], double* variance, int m) noexcept nogil:
+    cdef double total = 0.0, own = 0.0
+    cdef int a
+    for a in range(m):
+        total += s[a][a]
+        own += variance[a]
+    return total <= TELLING * own
 
 
 cdef bint is_trusted(double* memory) noexcept nogil:
@@ -1093,9 +1144,11 @@ cdef class Kernel:
     cdef double* p
     cdef double* auxiliary
     cdef double* memory
+    cdef double* bank
     cdef int64_t* stamps
     cdef int64_t* source_stamps
-    cdef int numbers_size
+    cdef double heading_variance
+    cdef int numbers_size, core_size  # of a state, with and without the bank of hypotheses
 
     def __init__(self, plan):
         import numpy as np
@@ -1128,7 +1181,9 @@ cdef class Kernel:
         self.still_gyro2 = plan.still_gyro * plan.still_gyro
         self.still_accel2 = plan.motion.still_accel_mps2 * plan.motion.still_accel_mps2
         self.zero_velocity_factor = plan.zero_velocity_factor
-        self.numbers_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
+        self.heading_variance = plan.heading_variance
+        self.core_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
+        self.numbers_size = self.core_size + HYPOTHESES * BLOCK
 
     cdef int bind(self, double[::1] numbers, int64_t[::1] whole) except -1:
         if numbers.shape[0] != self.numbers_size:
@@ -1139,6 +1194,7 @@ cdef class Kernel:
         self.p = self.x + NOMINAL_SIZE
         self.auxiliary = self.p + n * n
         self.memory = self.auxiliary + AUXILIARY_SIZE
+        self.bank = self.x + self.core_size
         self.stamps = &whole[0]
         self.source_stamps = self.stamps + STAMPS_SIZE
         return 0
@@ -1247,9 +1303,14 @@ cdef class Kernel:
 
     cpdef Py_ssize_t restore(self, Py_ssize_t kept, Py_ssize_t first_changed):
         """fusiond.kernel.Kernel.restore"""
+        cdef size_t bank_bytes = HYPOTHESES * BLOCK * sizeof(double)
         while self.kept_applied[kept - 1] > first_changed:
             kept -= 1
-        memcpy(&self.head_numbers[0], &self.kept_numbers[kept - 1, 0], self.head_numbers.shape[0] * sizeof(double))
+        memcpy(&self.head_numbers[0], &self.kept_numbers[kept - 1, 0], self.core_size * sizeof(double))
+        if self.kept_whole[kept - 1, PHASE] == CHOOSING:
+            memcpy(&self.head_numbers[self.core_size], &self.kept_numbers[kept - 1, self.core_size], bank_bytes)
+        elif self.head_whole[PHASE] == CHOOSING:
+            memset(&self.head_numbers[self.core_size], 0, bank_bytes)
         memcpy(&self.head_whole[0], &self.kept_whole[kept - 1, 0], self.head_whole.shape[0] * sizeof(int64_t))
         return kept
 
@@ -1263,7 +1324,7 @@ cdef class Kernel:
         cdef Py_ssize_t applied = applied_io[0], kept = kept_io[0]
         cdef Row* rows = &self.table[0] + begin
         cdef Py_ssize_t count = end - begin, following = applied, room = self.kept_applied.shape[0]
-        cdef Py_ssize_t whole_size = self.head_whole.shape[0]
+        cdef Py_ssize_t whole_size = self.head_whole.shape[0], size
         cdef int32_t before
         cdef int64_t last
         cdef bint safe, done = False
@@ -1292,7 +1353,8 @@ cdef class Kernel:
                 last = self.kept_whole[kept - 1, T]
                 safe = self.models[row.source] == IMU or self.stamps[T] - self.stamps[T_IMU] > self.imu_gap
                 if safe and self.stamps[T] - last >= self.snapshot_interval:
-                    memcpy(&self.kept_numbers[kept, 0], self.x, self.numbers_size * sizeof(double))
+                    size = self.numbers_size if self.stamps[PHASE] == CHOOSING else self.core_size
+                    memcpy(&self.kept_numbers[kept, 0], self.x, size * sizeof(double))
                     memcpy(&self.kept_whole[kept, 0], self.stamps, whole_size * sizeof(int64_t))
                     self.kept_applied[kept] = applied
                     kept += 1
@@ -1315,17 +1377,21 @@ cdef class Kernel:
             self.gather(row)
             self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] = row.t_ns
             return
-        self.advance(row.t_ns, imu)
-        if self.models[row.source] == IMU:
-            self.hold(row)
+        if self.stamps[PHASE] == CHOOSING:
+            self.choose(row, imu)
         else:
-            self.measure(row)
-        self.guard(whole_size)
+            self.advance(row.t_ns, imu)
+            if self.models[row.source] == IMU:
+                self.hold(row)
+                self.constrain()
+            else:
+                self.measure(row)
+            self.guard(whole_size)
         self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] = row.t_ns
 
     cdef bint knows(self, int32_t model) noexcept nogil:
         """Whether this kernel can take an event of a model now; a start is left to the twin, and with it GNSS until then."""
-        if self.stamps[PHASE] == RUNNING:
+        if self.stamps[PHASE] == RUNNING or self.stamps[PHASE] == CHOOSING:
             return model < COMPILED
         return self.stamps[PHASE] == ALIGNING and (model == IMU or model == WHEEL_SPEED)
 
@@ -1424,7 +1490,6 @@ cdef class Kernel:
             judge(memory, stamps, NULL, 0, same, row.t_ns)
         self.keep_sample(row)
         self.watch(row, dt)
-        self.constrain()
 
     cdef void watch(self, Row* row, double dt) noexcept nogil:
         cdef double* a = self.auxiliary
@@ -1485,49 +1550,257 @@ cdef class Kernel:
                         return False
         return fresh
 
-    cdef void constrain(self) noexcept nogil:
+    cdef int due(self) noexcept nogil:
+        """fusiond.motion.constraints_due: 1 still, 2 rolling, 3 both."""
         cdef int64_t now = self.stamps[T]
-        cdef Observation seen
-        cdef double v[3]
-        cdef double by[3 * n]
-        cdef double c[9]
-        cdef double earth[3]
-        cdef double* parameter
-        cdef int i, j
+        cdef int found = 0
         if now - self.stamps[T_CONSTRAINT] < self.constraint_interval:
-            return
+            return 0
         self.stamps[T_CONSTRAINT] = now
         if self.stamps[T_STILL] != NEVER and now - self.stamps[T_STILL] >= self.still_after:
-            seen.m = 3
-            memset(seen.jacobian, 0, 3 * n * sizeof(double))
-            for i in range(3):
-                seen.jacobian[i * n + VELOCITY + i] = 1.0
-                seen.innovation[i] = -self.x[VELOCITY_E + i]
-                seen.variance[i] = self.constraints[1, 0]
+            found = 1
+        if self.non_holonomic and not self.is_carried():
+            found += 2
+        return found
+
+    cdef void constrain(self) noexcept nogil:
+        cdef Observation seen
+        cdef int due = self.due()
+        if due & 1:
+            self.see_rest(&seen)
             if self.apply(1, &seen, self.zero_velocity_factor):  # rejected: it is a quiet drive
-                matrix(self.x + QUATERNION_EB, c)
-                memset(seen.jacobian, 0, 3 * n * sizeof(double))
-                for i in range(3):
-                    seen.jacobian[i * n + GYRO_BIAS + i] = 1.0
-                    # mat_eb' @ skew(earth rate along z)
-                    seen.jacobian[i * n + ATTITUDE] = c[3 + i] * EARTH_RATE
-                    seen.jacobian[i * n + ATTITUDE + 1] = -(c[i] * EARTH_RATE)
-                    seen.innovation[i] = (
-                        self.auxiliary[RATE_B + i] - self.x[GYRO_BIAS_B + i] - c[6 + i] * EARTH_RATE)
-                    seen.variance[i] = self.constraints[2, 0]
+                self.see_no_turn(&seen)
                 self.apply(2, &seen, 1.0)
                 return
-        if self.non_holonomic and not self.is_carried():
-            parameter = &self.constraints[0, 0]
-            point_velocity(self.x, self.auxiliary, parameter, 1, 3, v, by)
-            if fabs(v[0]) < parameter[5]:
-                return
-            seen.m = 2
-            memcpy(seen.jacobian, by + n, 2 * n * sizeof(double))
-            for i in range(2):
-                seen.innovation[i] = -v[1 + i]
-                seen.variance[i] = parameter[3 + i]
+        if due & 2 and fabs(self.see_rolling(&seen)) >= self.constraints[0, 5]:
             self.apply(0, &seen, 1.0)
+
+    cdef void see_rest(self, Observation* seen) noexcept nogil:
+        cdef int i
+        seen.m = 3
+        memset(seen.jacobian, 0, 3 * n * sizeof(double))
+        for i in range(3):
+            seen.jacobian[i * n + VELOCITY + i] = 1.0
+            seen.innovation[i] = -self.x[VELOCITY_E + i]
+            seen.variance[i] = self.constraints[1, 0]
+
+    cdef void see_no_turn(self, Observation* seen) noexcept nogil:
+        cdef double c[9]
+        cdef int i
+        matrix(self.x + QUATERNION_EB, c)
+        seen.m = 3
+        memset(seen.jacobian, 0, 3 * n * sizeof(double))
+        for i in range(3):
+            seen.jacobian[i * n + GYRO_BIAS + i] = 1.0
+            # mat_eb' @ skew(earth rate along z)
+            seen.jacobian[i * n + ATTITUDE] = c[3 + i] * EARTH_RATE
+            seen.jacobian[i * n + ATTITUDE + 1] = -(c[i] * EARTH_RATE)
+            seen.innovation[i] = self.auxiliary[RATE_B + i] - self.x[GYRO_BIAS_B + i] - c[6 + i] * EARTH_RATE
+            seen.variance[i] = self.constraints[2, 0]
+
+    cdef double see_rolling(self, Observation* seen) noexcept nogil:
+        """The non-holonomic constraint; returns the speed [m/s] forward, or while the heading is being chosen over ground."""
+        cdef double v[3]
+        cdef double by[3 * n]
+        cdef double* parameter = &self.constraints[0, 0]
+        cdef int i
+        point_velocity(self.x, self.auxiliary, parameter, 0, 3, v, by)
+        seen.m = 2
+        memcpy(seen.jacobian, by + n, 2 * n * sizeof(double))
+        for i in range(2):
+            seen.innovation[i] = -v[1 + i]
+            seen.variance[i] = parameter[3 + i]
+        return v[0] if self.stamps[PHASE] == RUNNING else sqrt(v[0] * v[0] + v[1] * v[1])
+
+    # The bank of heading hypotheses (fusiond.bank)
+
+    cdef void look_at(self, int i) noexcept nogil:
+        """Let x and P be those of a hypothesis."""
+        self.x = self.bank + i * BLOCK + 1
+        self.p = self.x + NOMINAL_SIZE
+
+    cdef void choose(self, Row* row, Row* imu) noexcept nogil:
+        """fusiond.kernel._choose"""
+        cdef double* x = self.x
+        cdef double* p = self.p
+        cdef double* memory = self.memory + row.source * MEMORY_SIZE
+        cdef double* parameter = &self.parameters[row.source, 0]
+        cdef int64_t* stamps = self.source_stamps + row.source * SOURCE_STAMPS_SIZE
+        cdef int64_t begin = self.stamps[T]
+        cdef int model = self.models[row.source], i
+        cdef double factor
+        for i in range(HYPOTHESES):
+            if self.bank[i * BLOCK] > 0:
+                self.stamps[T] = begin
+                self.look_at(i)
+                self.advance(row.t_ns, imu)
+        self.stamps[T] = row.t_ns if row.t_ns > begin else begin
+        if model == IMU:
+            self.hold(row)
+            self.constrain_bank()
+        else:
+            arrive(memory, stamps, row)
+            self.remember(model, memory, row)
+            if model == WHEEL_SPEED and self.carried(memory[LAST_VALUE]):
+                row.outcome = REJECTED
+            else:
+                factor = self.alike(model, row, parameter, stamps)
+                for i in range(HYPOTHESES):
+                    if self.bank[i * BLOCK] > 0:
+                        self.look_at(i)
+                        self.choose_by(i, model, row, parameter, factor)
+                stamps[T_FUSED] = row.t_ns
+                if model == GNSS_POSITION:
+                    self.stamps[T_POSITION] = row.t_ns
+                self.x = x
+                self.p = p
+                self.settle()
+        self.x = x
+        self.p = p
+
+    cdef void choose_by(self, int i, int model, Row* row, double* parameter, double factor) noexcept nogil:
+        cdef Observation seen
+        cdef int a
+        if model == WHEEL_SPEED:
+            wheel(self.x, self.p, self.auxiliary, row.values, parameter, &seen, True)
+            seen.variance[0] = seen.variance[0] * parameter[SHARED]
+            self.weigh(i, &seen, factor)
+        self.observe(model, row, parameter, &seen)
+        for a in range(seen.m):
+            seen.variance[a] = seen.variance[a] * parameter[SHARED]
+        if model != WHEEL_SPEED:
+            self.weigh(i, &seen, factor)
+        self.renew(&seen, factor)
+
+    cdef void take(self, int i, Observation* seen, double factor) noexcept nogil:
+        """fusiond.bank.take, of the hypothesis that is looked at."""
+        self.weigh(i, seen, factor)
+        self.renew(seen, factor)
+
+    cdef void renew(self, Observation* seen, double factor) noexcept nogil:
+        cdef double across[3][n]
+        cdef double s[3][3]
+        project(self.p, seen, across, s)
+        update(self.x, self.p, seen, self.gates[seen.m], factor, True, BANK_CLUTTER, across, s)
+
+    cdef void weigh(self, int i, Observation* seen, double factor) noexcept nogil:
+        cdef double across[3][n]
+        cdef double s[3][3]
+        cdef double low[3][3]
+        cdef double widened[3]
+        cdef double whitened[3]
+        cdef double square = 0.0, size = 1.0, floored
+        cdef int a
+        project(self.p, seen, across, s)
+        for a in range(seen.m):
+            widened[a] = factor * seen.variance[a]
+        if cholesky(s, widened, 1.0, seen.m, low) and whiten(s, seen, widened, whitened):
+            for a in range(seen.m):
+                square += whitened[a] * whitened[a]
+                size *= low[a][a]
+            floored = exponential(-(square if square < 1000.0 else 1000.0) / (2 * OUTLIER_VARIANCE))
+            for a in range(seen.m):
+                floored /= sqrt(OUTLIER_VARIANCE)
+            self.bank[i * BLOCK] *= ((1 - OUTLIERS) * exponential(-square / 2) + OUTLIERS * floored) / size
+
+    cdef void constrain_bank(self) noexcept nogil:
+        cdef Observation seen
+        cdef double fastest = 0.0, speed
+        cdef int i, due = self.due()
+        if due == 0:
+            return
+        if due == 2:
+            for i in range(HYPOTHESES):
+                if self.bank[i * BLOCK] > 0:
+                    self.look_at(i)
+                    speed = self.see_rolling(&seen)
+                    if speed > fastest:
+                        fastest = speed
+        for i in range(HYPOTHESES):
+            if self.bank[i * BLOCK] > 0:
+                self.look_at(i)
+                if due & 1:
+                    self.see_rest(&seen)
+                    self.take(i, &seen, self.zero_velocity_factor)
+                    self.see_no_turn(&seen)
+                    self.take(i, &seen, 1.0)
+                elif fastest >= self.constraints[0, 5]:
+                    self.see_rolling(&seen)
+                    self.take(i, &seen, 1.0)
+        self.normalise_bank()
+
+    cdef void normalise_bank(self) noexcept nogil:
+        cdef double total = 0.0
+        cdef int i
+        for i in range(HYPOTHESES):
+            total += self.bank[i * BLOCK]
+        for i in range(HYPOTHESES):
+            self.bank[i * BLOCK] = self.bank[i * BLOCK] / total if total > 0 else 0.0
+            if self.bank[i * BLOCK] < LEAST_WEIGHT:
+                self.bank[i * BLOCK] = 0.0
+
+    cdef void settle(self) noexcept nogil:
+        """fusiond.bank.settle"""
+        cdef double errors[HYPOTHESES][n]
+        cdef double turns[HYPOTHESES]
+        cdef double to_n[9]
+        cdef double turned[3]
+        cdef double mean = 0.0, spread = 0.0, own
+        cdef double* down = to_n + 6
+        cdef double* best
+        cdef double* p
+        cdef int i, a, chosen = -1
+        self.normalise_bank()
+        for i in range(HYPOTHESES):
+            if self.bank[i * BLOCK] > 0 and (chosen < 0 or self.bank[i * BLOCK] > self.bank[chosen * BLOCK]):
+                chosen = i
+        if chosen < 0:
+            return
+        best = self.bank + chosen * BLOCK + 1
+        mat_ne(best + POSITION_E, to_n)
+        for i in range(HYPOTHESES):
+            if self.bank[i * BLOCK] > 0:
+                difference(self.bank + i * BLOCK + 1, best, errors[i])
+                turns[i] = (down[0] * errors[i][ATTITUDE] + down[1] * errors[i][ATTITUDE + 1]
+                            + down[2] * errors[i][ATTITUDE + 2])
+                mean += self.bank[i * BLOCK] * turns[i]
+        for i in range(HYPOTHESES):
+            if self.bank[i * BLOCK] > 0:
+                p = self.bank + i * BLOCK + 1 + NOMINAL_SIZE
+                for a in range(3):
+                    turned[a] = (p[(ATTITUDE + a) * n + ATTITUDE] * down[0] + p[(ATTITUDE + a) * n + ATTITUDE + 1] * down[1]
+                                 + p[(ATTITUDE + a) * n + ATTITUDE + 2] * down[2])
+                own = down[0] * turned[0] + down[1] * turned[1] + down[2] * turned[2]
+                spread += self.bank[i * BLOCK] * (own + (turns[i] - mean) * (turns[i] - mean))
+        if spread <= self.heading_variance:
+            self.collapse(best, errors)
+
+    cdef void collapse(self, double* best, double errors[HYPOTHESES][n]) noexcept nogil:
+        """fusiond.bank._collapse"""
+        cdef double mean[n]
+        cdef double weight
+        cdef double* p
+        cdef int i, j, k
+        memset(mean, 0, sizeof(mean))
+        memset(self.p, 0, n * n * sizeof(double))
+        for i in range(HYPOTHESES):
+            if self.bank[i * BLOCK] > 0:
+                axpy(mean, self.bank[i * BLOCK], errors[i])
+        for i in range(HYPOTHESES):
+            weight = self.bank[i * BLOCK]
+            if weight > 0:
+                p = self.bank + i * BLOCK + 1 + NOMINAL_SIZE
+                for j in range(n):
+                    for k in range(n):
+                        self.p[j * n + k] += weight * (
+                            p[j * n + k] + (errors[i][j] - mean[j]) * (errors[i][k] - mean[k]))
+        mirror(self.p)
+        memcpy(self.x, best, NOMINAL_SIZE * sizeof(double))
+        inject(self.x, mean)
+        memset(self.bank, 0, HYPOTHESES * BLOCK * sizeof(double))
+        self.stamps[PHASE] = RUNNING
+        for i in range(self.sources):
+            self.source_stamps[i * SOURCE_STAMPS_SIZE + T_JUDGED] = NEVER
 
     cdef bint apply(self, int which, Observation* seen, double factor) noexcept nogil:
         cdef double across[3][n]
@@ -1538,6 +1811,32 @@ cdef class Kernel:
         self.auxiliary[CONSTRAINT_RATIO + which] = done.ratio
         self.stamps[(CONSTRAINT_FUSED if done.fused else CONSTRAINT_REJECTED) + which] += 1
         return done.fused
+
+    cdef void remember(self, int model, double* memory, Row* row) noexcept nogil:
+        """fusiond.kernel.remember"""
+        if model == WHEEL_SPEED:
+            memory[LAST_VALUE] = row.values[0]
+        elif model == GNSS_VELOCITY:
+            memory[LAST_VALUE] = sqrt(row.values[0] * row.values[0] + row.values[1] * row.values[1]) - 3 * sqrt(row.values[3])
+
+    cdef void observe(self, int model, Row* row, double* parameter, Observation* seen) noexcept nogil:
+        if model == WHEEL_SPEED:
+            wheel(self.x, self.p, self.auxiliary, row.values, parameter, seen, False)
+        elif model == GNSS_POSITION:
+            gnss_position(self.x, self.auxiliary, row.values, parameter, seen)
+        else:
+            gnss_velocity(self.x, self.auxiliary, row.values, parameter, seen)
+
+    cdef double alike(self, int model, Row* row, double* parameter, int64_t* stamps) noexcept nogil:
+        """fusiond.kernel._factor"""
+        cdef double correlation = row.values[2] if model == WHEEL_SPEED else parameter[3], interval, same
+        if not correlation > 0 or stamps[T_FUSED] == NEVER:
+            return 1.0
+        interval = (row.t_ns - stamps[T_FUSED]) * 1e-9
+        if interval < 1e-6:
+            interval = 1e-6
+        same = exponential(-interval / correlation)
+        return (1 + same) / (1 - same)
 
     cdef void measure(self, Row* row) noexcept nogil:
         cdef int model = self.models[row.source], a, companion
@@ -1551,20 +1850,14 @@ cdef class Kernel:
         cdef double given[3]
         cdef double learnt[3]
         cdef double whitened[3]
-        cdef double factor = 1.0, interval, alike, correlation, elapsed = 0.0, share
+        cdef double factor, elapsed = 0.0, share
         cdef int64_t pause
         cdef bint same, trusted
         same = arrive(memory, stamps, row)
         if stamps[T_LAST] != NEVER:
             elapsed = (row.t_ns - stamps[T_LAST]) * 1e-9
-        if model == WHEEL_SPEED:
-            memory[LAST_VALUE] = row.values[0]
-            wheel(self.x, self.p, self.auxiliary, row.values, parameter, &seen)
-        elif model == GNSS_POSITION:
-            gnss_position(self.x, self.auxiliary, row.values, parameter, &seen)
-        else:
-            memory[LAST_VALUE] = sqrt(row.values[0] * row.values[0] + row.values[1] * row.values[1]) - 3 * sqrt(row.values[3])
-            gnss_velocity(self.x, self.auxiliary, row.values, parameter, &seen)
+        self.remember(model, memory, row)
+        self.observe(model, row, parameter, &seen)
         project(self.p, &seen, across, s)
         share = 1 + memory[NOISE_EXCESS]
         if share < parameter[NOISE_LEAST]:
@@ -1576,16 +1869,14 @@ cdef class Kernel:
             learnt[a] = given[a] * share
             row.innovation[a] = seen.innovation[a]
             row.variance[a] = s[a][a] + learnt[a]
-        correlation = row.values[2] if model == WHEEL_SPEED else parameter[3]
-        if correlation > 0 and stamps[T_FUSED] != NEVER:
-            interval = (row.t_ns - stamps[T_FUSED]) * 1e-9
-            if interval < 1e-6:
-                interval = 1e-6
-            alike = exponential(-interval / correlation)
-            factor = (1 + alike) / (1 - alike)
-        pause = <int64_t>(2e9 * correlation)
+        factor = self.alike(model, row, parameter, stamps)
+        if stamps[T_LAST] == NEVER or row.t_ns - stamps[T_LAST] > OUTAGE_NS:
+            stamps[T_FUSED] = NEVER
+            stamps[T_BACK] = row.t_ns
+            begin_health(memory)
+        pause = <int64_t>(2e9 * (row.values[2] if model == WHEEL_SPEED else parameter[3]))
         if stamps[T_JUDGED] == NEVER or row.t_ns - stamps[T_JUDGED] >= (pause if pause > JUDGE_NS else JUDGE_NS):
-            if whiten(s, &seen, learnt, whitened):
+            if stamps[T_FUSED] != NEVER and tells(s, learnt, seen.m) and whiten(s, &seen, learnt, whitened):
                 judge(memory, stamps, whitened, seen.m, same, row.t_ns)
         learn(memory, &seen, given, s, elapsed)
         companion = <int>parameter[COMPANION]
@@ -1624,7 +1915,8 @@ cdef class Kernel:
             return False
         if companion >= 0 and not is_trusted(self.memory + companion * MEMORY_SIZE):
             wait = SUSPECT * wait
-        elif stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS:
+        elif stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS or \
+                stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS:
             if memory[LAST_RATIO] <= NEAR:
                 wait = self.gnss_return
         return row.t_ns - stamps[T_ALIKE] >= wait

@@ -40,7 +40,8 @@ class Filter(Section, frozen=True, kw_only=True):
     v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # given start heading, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
-    course_speed_mps: Positive = 3.0  # above this GNSS speed its course gives the start heading
+    heading_spread_deg: Annotated[float, Meta(gt=0, le=30)] = 8.0  # headings this close together are chosen between no more
+    course_speed_mps: Positive = 8.0  # above this GNSS speed, at which it never reverses, its course is the start heading
     level_sigma_deg: Positive = 3.0  # sigma of roll and pitch after leveling on the accelerometer
     position_timeout_s: Seconds = 2.0  # without a position fix for this long: dead reckoning
     lost_sigma_m: Positive = 200.0  # horizontal position sigma beyond which the state is called lost

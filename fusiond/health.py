@@ -46,8 +46,10 @@ FIRST_BIAS_VARIANCE = 100.0  # of a biased source's bias, likewise
 BIAS_WALK = 0.01  # how fast a bias changes: variance added at each sample
 FARTHEST = 1000.0  # a squared innovation beyond is no stranger than this: no likelihood vanishes
 LEAST_BIAS = 3.0  # a smaller bias, in sigmas, is not called one
-SAME_IF_NOT_FROZEN = 1 / 3  # chance that a good sensor repeats a reading to the bit
+SAME_IF_NOMINAL = 1 / 3  # chance that a good sensor repeats a reading to the bit
+SAME_IF_FAULTY = 1 / 20  # chance that a noisy or biased one does
 OTHER_IF_FROZEN = 1e-3  # chance that a frozen one does not
+TELLING = 4.0  # times the sensor's own variance: what more than that has told is the state, not the sensor
 NOTED = 0.1  # a source that is noisy with at most this probability is taken as it is
 NOTHING = np.zeros(0)
 DISTRUST = 0.5  # a source that is biased or frozen with more than this probability is not fused
@@ -87,6 +89,16 @@ def begin(memory: Array) -> None:
     memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
 
 
+def tells(predicted: Array, variance: Array) -> bool:
+    """Whether an innovation tells of the sensor: H P H' and R, (m,) each, the one not far above the other. A state that is
+    uncertain, after an outage, is off alike at every look."""
+    total = own = 0.0
+    for a in range(len(variance)):
+        total += predicted[a]
+        own += variance[a]
+    return total <= TELLING * own
+
+
 def judge_repetition(memory: Array, stamps: NDArray[np.int64], same: bool, t_ns: int) -> None:
     """The same for a source without innovations, the inertial sensor: only a frozen one shows."""
     if is_due(stamps, t_ns, 0.0):
@@ -106,6 +118,7 @@ def judge(memory: Array, stamps: NDArray[np.int64], look: Judgement) -> None:
     stamps[T_JUDGED] = look.t_ns
     blurred = 1 - exp(-elapsed / KEEPS)
     total = 0.0
+    _renew_bias(memory, look.whitened)
     for i, likelihood in enumerate(likelihoods(memory, look.whitened, look.same)):
         place = NOMINAL + i
         memory[place] = (memory[place] + blurred * (PRIOR[i] - memory[place])) * likelihood
@@ -129,9 +142,22 @@ def likelihoods(memory: Array, whitened: Array, same: bool) -> tuple[float, floa
     good = (1 - OUTLIERS) * _density(square, 1.0, m) + OUTLIERS * outlier
     noisy = (1 - OUTLIERS) * _density(square, NOISY_VARIANCE, m) + OUTLIERS * outlier
     biased = (1 - OUTLIERS) * _density(off, variance, m) + OUTLIERS * outlier
-    alike = SAME_IF_NOT_FROZEN if same else 1.0
-    frozen = outlier * (1.0 if same else OTHER_IF_FROZEN)
-    return good * alike, noisy * alike, biased * alike, frozen
+    if not same:
+        return good, noisy, biased, outlier * OTHER_IF_FROZEN
+    return good * SAME_IF_NOMINAL, noisy * SAME_IF_FAULTY, biased * SAME_IF_FAULTY, outlier
+
+
+def _renew_bias(memory: Array, whitened: Array) -> None:
+    """Forget the bias where a new one, of which nothing is known, explains the innovation better."""
+    m = len(whitened)
+    square = off = 0.0
+    for a in range(m):
+        square += whitened[a] * whitened[a]
+        rest = whitened[a] - memory[BIAS.start + a]
+        off += rest * rest
+    if _density(square, 1 + FIRST_BIAS_VARIANCE, m) > _density(off, 1 + memory[BIAS_VARIANCE], m):
+        memory[BIAS] = 0.0
+        memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
 
 
 def _density(square: float, variance: float, m: int) -> float:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond import alignment, health
+from fusiond import alignment, bank, health
 from fusiond.earth import Array, mat_ne
 from fusiond.motion import carried, constrain, watch
 from fusiond.observe import MODELS, gnss_velocity, wheel_speed
@@ -27,6 +27,7 @@ from fusiond.observe.model import CLUTTER, COMPANION, CORRELATION, NOISE_LEAST, 
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
+    CHOOSING,
     EMPTY,
     FORCE_B,
     HELD_FORCE_B,
@@ -41,6 +42,7 @@ from fusiond.state import (
     RESETS,
     RUNNING,
     T_ALIKE,
+    T_BACK,
     T_FUSED,
     T_IMU,
     T_LAST,
@@ -85,7 +87,7 @@ ROW = np.dtype(
 Rows = NDArray[Any]  # structured, of dtype ROW
 
 BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
-OUTAGE_NS = 10_000_000_000  # a source not fused for longer before it was rejected comes back from an outage
+OUTAGE_NS = 10_000_000_000  # a source silent for longer, or not fused for longer before it was rejected, comes back anew
 SUSPECT = 6  # times gnss_reset_s, where the receiver's velocity is not trusted
 NEAR = 9.0  # test ratio up to which a fix after an outage is believed soon
 
@@ -274,7 +276,9 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
             stamps[RESETS] += 1
         alignment.begin(state)
     row["outcome"] = Outcome.FUSED
-    if stamps[PHASE] != RUNNING:
+    if stamps[PHASE] == CHOOSING:
+        _choose(state, row, rows[following_imu] if following_imu < len(rows) else None, plan)
+    elif stamps[PHASE] != RUNNING:
         alignment.gather(state, t_ns, source, values, plan)
     else:
         advance(state, t_ns, rows[following_imu] if following_imu < len(rows) else None, plan)
@@ -327,8 +331,67 @@ def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
     stamps[T] = t_ns
 
 
+def _choose(state: FilterState, row: Any, imu: Any | None, plan: Plan) -> None:
+    """Take one event into every hypothesis of the bank."""
+    stamps, source, t_ns = state.stamps, int(row["source"]), int(row["t_ns"])
+    begin, model, values = stamps[T], plan.models[source], row["values"]
+    for i in bank.alive(state):
+        stamps[T] = begin
+        advance(state.hypothesis(i), t_ns, imu, plan)
+    stamps[T] = max(begin, t_ns)
+    if model == IMU:
+        _keep_sample(state, t_ns, values, plan)
+        bank.constrain(state, plan)
+        return
+    memory, own, parameters = state.memory[source], state.source_stamps[source], plan.parameters[source]
+    health.arrive(memory, own, values, t_ns)
+    remember(memory, model, values)
+    if model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan):
+        row["outcome"] = Outcome.REJECTED
+        return
+    factor = _factor(own, model, values, parameters, t_ns)
+    for i in bank.alive(state):
+        hypothesis = state.hypothesis(i)
+        seen = MODELS[model].observe(hypothesis, values, parameters)
+        assert seen is not None, "a source's model always observes"
+        seen, certain = seen._replace(variance=seen.variance * parameters[SHARED]), None
+        if model == MODEL["wheel_speed"]:
+            certain = wheel_speed.observe(hypothesis, values, parameters, certain=True)
+            certain = certain._replace(variance=certain.variance * parameters[SHARED])
+        bank.take(state, i, hypothesis, seen, plan.gates[len(seen.innovation)], factor, certain)
+    own[T_FUSED] = t_ns
+    if model == MODEL["gnss_position"]:
+        stamps[T_POSITION] = t_ns
+    bank.settle(state, plan)
+
+
+def remember(memory: Array, model: int, values: Array) -> None:
+    """What the motion detector wants to know of a source's last reading."""
+    if model == MODEL["wheel_speed"]:
+        memory[LAST_VALUE] = values[wheel_speed.SPEED]
+    elif model == MODEL["gnss_velocity"]:
+        memory[LAST_VALUE] = gnss_velocity.least_speed(values)
+
+
+def _factor(stamps: NDArray[np.int64], model: int, values: Array, parameters: Array, t_ns: int) -> float:
+    """How much less a reading is worth because its error is like that of the one before."""
+    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
+    return correlation_factor(interval, correlation(model, values, parameters))
+
+
+def correlation(model: int, values: Array, parameters: Array) -> float:
+    """Time [s] over which a reading's error stays alike."""
+    return float(values[wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION])
+
+
 def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
-    """Make an IMU sample the held one; let it tell of standstill; apply the constraints that are due."""
+    """Make an IMU sample the held one, and apply the constraints that are due."""
+    _keep_sample(state, t_ns, values, plan)
+    constrain(state, plan)
+
+
+def _keep_sample(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
+    """Make an IMU sample the held one; let it tell of standstill."""
     stamps, auxiliary = state.stamps, state.auxiliary
     dt = (t_ns - int(stamps[T_IMU])) * 1e-9 if stamps[T_IMU] != NEVER else 0.0
     memory, own = state.memory[plan.imu_source], state.source_stamps[plan.imu_source]
@@ -338,7 +401,6 @@ def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
     auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = values[0:3]
     auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = values[3:6]
     watch(state, values[0:3], values[3:6], dt, plan)
-    constrain(state, plan)
 
 
 def _measure(state: FilterState, row: Any, plan: Plan) -> None:
@@ -347,10 +409,7 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     model, values = plan.models[source], row["values"]
     parameters, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
     same, elapsed = health.arrive(memory, stamps, values, t_ns)
-    if model == MODEL["wheel_speed"]:
-        memory[LAST_VALUE] = values[wheel_speed.SPEED]
-    elif model == MODEL["gnss_velocity"]:
-        memory[LAST_VALUE] = gnss_velocity.least_speed(values)
+    remember(memory, model, values)
     seen = MODELS[model].observe(state, values, parameters)
     assert seen is not None, "a source's model always observes"
     m = len(seen.innovation)
@@ -358,9 +417,12 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     given = seen.variance * parameters[SHARED]
     learnt = given * health.noise_factor(memory, parameters[NOISE_LEAST], parameters[NOISE_MOST])
     row["innovation"][:m], row["variance"][:m] = seen.innovation, predicted + learnt
-    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
-    correlation = values[wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION]
-    if health.is_due(stamps, t_ns, correlation):
+    factor = _factor(stamps, model, values, parameters, t_ns)
+    if stamps[T_LAST] == NEVER or t_ns - int(stamps[T_LAST]) > OUTAGE_NS:
+        stamps[T_FUSED], stamps[T_BACK] = NEVER, t_ns
+        health.begin(memory)
+    known = stamps[T_FUSED] != NEVER and health.tells(predicted, learnt)
+    if known and health.is_due(stamps, t_ns, correlation(model, values, parameters)):
         whitened = whiten(state, seen._replace(variance=learnt))
         if whitened is not None:
             health.judge(memory, stamps, health.Judgement(whitened, same, t_ns))
@@ -369,9 +431,7 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     trusted = health.is_trusted(memory) and (companion < 0 or health.is_trusted(state.memory[companion]))
     trusted = trusted and not (model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan))
     seen = seen._replace(variance=learnt * health.noisy_factor(memory))
-    ratio, fused = update(
-        state, seen, plan.gates[m], correlation_factor(interval, correlation), trusted, float(parameters[CLUTTER])
-    )
+    ratio, fused = update(state, seen, plan.gates[m], factor, trusted, float(parameters[CLUTTER]))
     row["ratio"] = memory[LAST_RATIO] = ratio
     if fused:
         stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
@@ -402,7 +462,11 @@ def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, p
     companion = int(plan.parameters[source, COMPANION])
     if companion >= 0 and not health.is_trusted(state.memory[companion]):
         wait = SUSPECT * wait
-    elif stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS:
+    elif (
+        stamps[T_FUSED] == NEVER
+        or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS
+        or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
+    ):
         near = memory[LAST_RATIO] <= NEAR
         wait = plan.gnss_return_ns if near else wait
     return t_ns - int(stamps[T_ALIKE]) >= wait

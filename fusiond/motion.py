@@ -87,15 +87,21 @@ def stands(state: FilterState, plan: Plan) -> bool:
 
 def constrain(state: FilterState, plan: Plan) -> None:
     """Apply the constraints that hold now, if the last round is an interval ago."""
-    now = state.stamps[T]
-    if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
-        return
-    state.stamps[T_CONSTRAINT] = now
-    still = state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns
+    still, rolling = constraints_due(state, plan)
     if still and _apply(state, ZERO_VELOCITY, plan, plan.zero_velocity_factor):  # rejected: it is a quiet drive
         _apply(state, ZERO_ROTATION, plan)
-    elif plan.motion.non_holonomic and not _is_carried(state, plan):
+    elif rolling:
         _apply(state, NON_HOLONOMIC, plan)
+
+
+def constraints_due(state: FilterState, plan: Plan) -> tuple[bool, bool]:
+    """Whether the vehicle stands, and whether its wheels keep it from going sideways, if it is time to look."""
+    now = state.stamps[T]
+    if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
+        return False, False
+    state.stamps[T_CONSTRAINT] = now
+    still = bool(state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns)
+    return still, plan.motion.non_holonomic and not _is_carried(state, plan)
 
 
 def _is_carried(state: FilterState, plan: Plan) -> bool:

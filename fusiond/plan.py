@@ -55,6 +55,7 @@ class Plan:
     restart_gap_ns: int
     gnss_reset_ns: int
     gnss_return_ns: int
+    heading_variance: float  # rad^2: the spread of the headings at which the bank is collapsed
     constraint_interval_ns: int
     still_after_ns: int
     still_gyro: float  # rad/s
@@ -108,6 +109,7 @@ def plan(config: Config) -> Plan:
         restart_gap_ns=nanoseconds(settings.restart_gap_s),
         gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
         gnss_return_ns=nanoseconds(min(settings.gnss_return_s, settings.gnss_reset_s)),
+        heading_variance=square(math.radians(settings.heading_spread_deg)),
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),
         still_gyro=math.radians(motion.still_gyro_deg_s),

@@ -86,7 +86,7 @@ T_FIRST_VELOCITY = 5  # ns, begin of the alignment window
 T_FIX = 6  # ns, of FIX_E
 T_REST = 7  # ns, end of the standstill that REST_RATE_B is the mean of
 T_START = 8  # ns, when the filter began to run
-PHASE = 9  # EMPTY, ALIGNING, RUNNING
+PHASE = 9  # EMPTY, ALIGNING, RUNNING, CHOOSING
 RESETS = 10  # count of jumps of the state
 CONSTRAINT_FUSED = slice(11, 14)  # counts: non-holonomic, zero velocity, zero rotation
 CONSTRAINT_REJECTED = slice(14, 17)
@@ -99,31 +99,57 @@ T_FUSED = 1  # ns, of its last event fused
 T_REJECTED = 2  # ns, of the first of an unbroken row of rejections; NEVER if there is none
 T_JUDGED = 3  # ns, of the last look at its health
 T_ALIKE = 4  # ns, since when its rejected readings are off alike; NEVER if there is none
-SOURCE_STAMPS_SIZE = 5
+T_BACK = 5  # ns, since when it is heard again after an outage, or for the first time
+SOURCE_STAMPS_SIZE = 6
 
-EMPTY, ALIGNING, RUNNING = 0, 1, 2
+EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
+HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.bank): twelve all round, and a stored one
 NEVER = -(2**62)
 
 
 class FilterState:
     """Views of the two arrays. `copy_from` and `copy` are the snapshot."""
 
-    __slots__ = ("auxiliary", "covariance", "memory", "nominal", "numbers", "size", "source_stamps", "stamps", "whole")
+    __slots__ = (
+        "auxiliary",
+        "bank",
+        "covariance",
+        "memory",
+        "nominal",
+        "numbers",
+        "size",
+        "source_stamps",
+        "stamps",
+        "whole",
+    )
 
     def __init__(self, sources: int, size: int = ERROR_SIZE) -> None:
         """An empty state for a number of sources and of error states."""
         self.size = size
-        ends = np.cumsum([NOMINAL_SIZE, size * size, AUXILIARY_SIZE, sources * MEMORY_SIZE])
+        block = 1 + NOMINAL_SIZE + size * size
+        sizes = [NOMINAL_SIZE, size * size, AUXILIARY_SIZE, sources * MEMORY_SIZE, HYPOTHESES * block]
+        ends = np.cumsum(sizes)
         self.numbers: Array = np.zeros(int(ends[-1]))
         self.nominal: Array = self.numbers[: ends[0]]
         self.covariance: Array = self.numbers[ends[0] : ends[1]].reshape(size, size)
         self.auxiliary: Array = self.numbers[ends[1] : ends[2]]
-        self.memory: Array = self.numbers[ends[2] :].reshape(sources, MEMORY_SIZE)
+        self.memory: Array = self.numbers[ends[2] : ends[3]].reshape(sources, MEMORY_SIZE)
+        self.bank: Array = self.numbers[ends[3] :].reshape(HYPOTHESES, block)  # weight, nominal, covariance of each
         self.whole: Stamps = np.full(STAMPS_SIZE + sources * SOURCE_STAMPS_SIZE, NEVER, dtype=np.int64)
         self.stamps: Stamps = self.whole[:STAMPS_SIZE]
         self.source_stamps: Stamps = self.whole[STAMPS_SIZE:].reshape(sources, SOURCE_STAMPS_SIZE)
         self.stamps[PHASE:] = 0
         self.nominal[QUATERNION_EB.start] = 1.0
+
+    def hypothesis(self, number: int) -> FilterState:
+        """A view of one hypothesis as a state: nominal and covariance are its own, the rest is shared."""
+        view = FilterState.__new__(FilterState)
+        view.size, view.numbers, view.whole, view.bank = self.size, self.numbers, self.whole, self.bank
+        view.auxiliary, view.memory, view.stamps = self.auxiliary, self.memory, self.stamps
+        view.source_stamps = self.source_stamps
+        view.nominal = self.bank[number, 1 : 1 + NOMINAL_SIZE]
+        view.covariance = self.bank[number, 1 + NOMINAL_SIZE :].reshape(self.size, self.size)
+        return view
 
     def copy_from(self, other: FilterState) -> None:
         self.numbers[:] = other.numbers

@@ -31,7 +31,7 @@ from fusiond.state import (
 )
 
 COAST_ACCEL = 2.0  # m/s^2/sqrt(Hz): what a vehicle may do while the inertial sensor is silent
-COAST_RATE = 0.2  # rad/s/sqrt(Hz)
+COAST_RATE = 0.5  # rad/s/sqrt(Hz): a car in a bend
 LONGEST_STEP = 0.05  # s: longer intervals are propagated in equal parts
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
 EARTH_RATE_SKEW = skew(EARTH_RATE_E)

@@ -128,7 +128,7 @@ def measurements(
         return strength * sigma * rng.standard_normal(size)
 
     for k in range(len(truth.seconds)):
-        shaken = 1.0 if truth.speed[k] > 0.1 else 0.1
+        shaken = 1.0 if abs(truth.speed[k]) > 0.1 else 0.1
         force = truth.force_b[k] + shaken * noise(0.05 / math.sqrt(step)) + accel_bias
         rate = truth.rate_b[k] + shaken * noise(0.002 / math.sqrt(step)) + gyro_bias
         add("imu0", k, k, ImuSample(triple(force), triple(rate)))
@@ -140,7 +140,7 @@ def measurements(
         add("gps0.velocity", k, i, GnssVelocity(north, east, down, 0.1))
     for place, name in enumerate(wheels):
         for i, k in enumerate(range(place, len(truth.seconds) - 1, round(1 / wheel_hz / step))):
-            reading = abs(float(truth.speed[k] + noise(0.05, 1)[0])) if truth.speed[k] > 0.1 else 0.0
+            reading = abs(float(truth.speed[k] + noise(0.05, 1)[0])) if abs(truth.speed[k]) > 0.1 else 0.0
             add(name, k, i, WheelSpeed(reading), round(step * 1e9) // 4 * (place % 3))
     return sorted(events, key=lambda event: event.key)
 

@@ -46,8 +46,9 @@ def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     return reading.speed, variance, alike
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
-    """Innovation (1,) [m/s]: reading less (1 + scale) times the contact point's speed."""
+def observe(state: FilterState, row: Array, parameter: Array, certain: bool = False) -> Observation:
+    """Innovation (1,) [m/s]: reading less (1 + scale) times the contact point's speed. With `certain` the state is taken at
+    its word: an unsigned wheel turns the way that it says."""
     velocity_v, by_error = point_velocity_v(state, parameter[LEVER_ARM_B])
     forward, sideways = float(velocity_v[0]), float(velocity_v[1])
     along = np.array([1.0, 0.0, 0.0])
@@ -62,7 +63,7 @@ def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
     jacobian[which] = speed
     reading, variance = row[SPEED], row[VARIANCE]
     if parameter[UNSIGNED] and reading > 0:
-        if abs(speed) > SURE_SPEED:
+        if certain or abs(speed) > SURE_SPEED:
             reading = math.copysign(reading, speed)
         else:
             spread = float(jacobian @ state.covariance @ jacobian) + variance
