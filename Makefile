@@ -58,7 +58,7 @@ uninstall:
 	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf
 	packaging/postrm remove
 
-$(READY): pyproject.toml setup.py fusiond/_kernel.pyx
+$(READY): pyproject.toml setup.py fusiond/_kernel.pxi
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'

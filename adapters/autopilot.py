@@ -16,9 +16,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fusiond.config import Autopilot, Config
 from fusiond.estimate import Mode
 from fusiond.messages import State, StateMessage
+from fusiond.sections import Autopilot, Config
 
 from .mavlink import message_id
 from .mavlink_answers import Parameter

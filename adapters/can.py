@@ -19,8 +19,8 @@ from typing import NamedTuple, TypeVar, cast
 import cantools
 from cantools.database.can import Database, Message, Signal
 
-from fusiond.config import Config, Wheel
 from fusiond.measurements import AnyPayload, Invalid, Received, WheelSpeed
+from fusiond.sections import Config, Wheel
 from fusiond.toml_file import ConfigError
 
 from .can_checksums import is_right

@@ -16,8 +16,8 @@ from typing import Any
 
 import can
 
-from fusiond.config import Config
 from fusiond.measurements import Received
+from fusiond.sections import Config
 
 from .can import EXTENDED, PDU2, CanDecoder
 from .can_socket import CanFrame, CanSocket

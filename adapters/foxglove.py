@@ -14,7 +14,6 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
-from fusiond.config import Config
 from fusiond.frames import ENU_FLU, LocalFrame
 from fusiond.messages import (
     MESSAGES,
@@ -29,6 +28,7 @@ from fusiond.messages import (
     StateMessage,
     encode,
 )
+from fusiond.sections import Config
 
 SECOND = 1_000_000_000  # ns
 ROOT, BODY = "local_enu", "base_link"  # frames

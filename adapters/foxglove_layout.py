@@ -7,8 +7,9 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from fusiond.config import Config, load
+from fusiond.config import load
 from fusiond.messages import HealthMessage, StateMessage
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.foxglove import BODY, LOCATION, LOG, ORIGIN, POSE, ROOT, TOPICS, innovations_topic, judged
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from threading import Event
 
-from fusiond.config import Config
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.foxglove import SHOWN, Converter, channels
 from fusiond_adapters.outputs import POLL_S, Outbox, OutputLost

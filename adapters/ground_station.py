@@ -16,9 +16,9 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common
 
-from fusiond.config import Config
 from fusiond.estimate import Mode
 from fusiond.messages import EventMessage, HealthMessage, Message, Severity, State, StateMessage
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 
 from .inputs import LiveInput

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from threading import Event, Lock
 from typing import Generic, Protocol, TypeVar
 
-from fusiond.config import Config
 from fusiond.measurements import Received
+from fusiond.sections import Config
 
 Item = TypeVar("Item")
 POLL_S = 0.2  # how long a thread waits for input before it looks whether it is to stop

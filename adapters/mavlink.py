@@ -23,7 +23,6 @@ from typing import Any
 import pymavlink.dialects.v20 as dialects
 from fastcrc.crc16 import mcrf4xx
 
-from fusiond.config import Config
 from fusiond.measurements import (
     HOST_CLOCK,
     UNIX_CLOCK,
@@ -32,6 +31,7 @@ from fusiond.measurements import (
     Received,
     boot_clock,
 )
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 
 from .mavlink_sensors import (

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from threading import Event, Lock
 from typing import Any
 
-from fusiond.config import Config
 from fusiond.measurements import Received
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 
 from .host_clock import HostClock

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from fusiond.config import Barometer, Config, Gnss, Imu, Wheel
 from fusiond.measurements import (
     AnyPayload,
     GnssPosition,
@@ -18,6 +17,7 @@ from fusiond.measurements import (
     Vector3,
     WheelSpeed,
 )
+from fusiond.sections import Barometer, Config, Gnss, Imu, Wheel
 
 SECOND = 1_000_000_000  # ns
 MILLI_G = 9.80665e-3  # m/s^2

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from fusiond.config import Config
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 
 from .mavlink import CHECKSUM, HEADER_2, MAGIC_2, SIGNED

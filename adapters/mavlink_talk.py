@@ -13,7 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common
 
-from fusiond.config import Config
+from fusiond.sections import Config
 
 from .mavlink import (
     HEADER_1,

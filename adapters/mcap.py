@@ -20,8 +20,8 @@ from types import TracebackType
 import msgspec
 
 from fusiond import __version__
-from fusiond.config import Config
 from fusiond.publication import config_table
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.foxglove import SHOWN, Channel, Converter, Record, channels
 from fusiond_adapters.logs.record import FLUSH_S, MEGABYTE, file_name, make_room

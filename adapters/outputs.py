@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from threading import Condition, Event
 from typing import Any, Protocol
 
-from fusiond.config import Config
 from fusiond.latency import RecentLatencies
 from fusiond.messages import Message, StateMessage
+from fusiond.sections import Config
 
 from .host_clock import HostClock
 from .inputs import LiveInput

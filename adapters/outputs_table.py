@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fusiond.config import Config
+from fusiond.sections import Config
 
 from .outputs import Around, Factory, LiveOutput
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
-from fusiond.config import Config
 from fusiond.estimate import Mode
 from fusiond.messages import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.outputs import POLL_S, Outbox, OutputLost
 

@@ -11,9 +11,9 @@ from threading import Event
 
 import zenoh
 
-from fusiond.config import Config, Ros2
-from fusiond.config import Zenoh as ZenohSection
 from fusiond.messages import HealthMessage, Message, StateMessage
+from fusiond.sections import Config, Ros2
+from fusiond.sections import Zenoh as ZenohSection
 from fusiond.toml_file import ConfigError
 
 from .outputs import POLL_S, Outbox, OutputLost

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from fusiond.config import Ros2
 from fusiond.estimate import Mode
 from fusiond.frames import LocalFrame, OdometryFrame
 from fusiond.messages import HealthMessage, InputHealth, OutputHealth, SourceHealth, State, StateMessage
+from fusiond.sections import Ros2
 
 from . import ros2_cdr as cdr
 from .ros2_cdr import ERROR, OK, WARN, Status

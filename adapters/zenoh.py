@@ -18,10 +18,10 @@ from typing import cast
 import zenoh
 import zenoh.ext
 
-from fusiond.config import Encoding
-from fusiond.config import Zenoh as ZenohSection
 from fusiond.messages import MESSAGES, InnovationMessage, Message, encode
 from fusiond.publication import key as key_of
+from fusiond.sections import Encoding
+from fusiond.sections import Zenoh as ZenohSection
 
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}

@@ -14,9 +14,9 @@ from threading import Lock
 
 import zenoh
 
-from fusiond.config import Config
 from fusiond.messages import Message, StateMessage, encode
 from fusiond.publication import key as key_of
+from fusiond.sections import Config
 
 from .zenoh import CONTENT_TYPES, message_key
 

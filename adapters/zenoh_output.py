@@ -6,8 +6,8 @@ from threading import Event
 
 import zenoh
 
-from fusiond.config import Config
 from fusiond.messages import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant
+from fusiond.sections import Config
 
 from .outputs import POLL_S, Outbox, OutputLost
 from .zenoh import PublishError, ZenohPublisher, open_session

@@ -23,11 +23,11 @@ import msgspec
 import numpy as np
 
 from fusiond import __version__
-from fusiond.config import Config
 from fusiond.fusion import Fusion
 from fusiond.kernel import ROW, Kernel, make_kernel
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.plan import SECOND
+from fusiond.sections import Config
 from fusiond.simulation.scenario import parse
 from fusiond.state import NEVER, T_LAST, FilterState, T
 from fusiond_adapters.logs.write import write_drive

@@ -27,10 +27,10 @@ import msgspec
 from pymavlink.dialects.v20 import common
 
 from benchmarks.latency import CAN_HZ, GNSS_HZ, GNSS_LATE_US, IMU_HZ, configuration, free_port, process, turn_wheels
-from fusiond.config import Config
 from fusiond.daemon import Daemon, punctual_loop
 from fusiond.messages import StateMessage, encode
 from fusiond.replay import Replay, Wants
+from fusiond.sections import Config
 from fusiond_adapters.can_bus import CanFrame
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.play import PlayedClock

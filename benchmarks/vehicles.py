@@ -23,7 +23,6 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 
 from fusiond.client import Client
-from fusiond.config import Zenoh
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.messages import (
     EventMessage,
@@ -36,6 +35,7 @@ from fusiond.messages import (
     StateMessage,
     state_message,
 )
+from fusiond.sections import Zenoh
 from fusiond_adapters.zenoh import KIND, ZenohPublisher, open_session
 
 GRACE_S = 3.0  # after the last publication, for what is fetched again

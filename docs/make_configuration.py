@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import msgspec
 from msgspec import Meta
 
-from fusiond.config import Config
+from fusiond.sections import Config
 from fusiond.simulation.scenario import Scenario
 from fusiond.toml_file import Name, Section
 

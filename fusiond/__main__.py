@@ -15,6 +15,7 @@ from fusiond import __version__, config, demo, report
 from fusiond.comparison import TruthError, Window
 from fusiond.describe import description, oddities
 from fusiond.replay import Options, OutputError, UsageError, parse_interval, parse_withheld, replay
+from fusiond.sections import Config
 from fusiond.simulation import scenario
 from fusiond.toml_file import ConfigError
 from fusiond_adapters import journal
@@ -154,7 +155,7 @@ def run_daemon(arguments: argparse.Namespace) -> None:
 
     journal.set_up()
 
-    def load() -> config.Config:
+    def load() -> Config:
         return config.load(arguments.config)
 
     with asyncio.Runner(loop_factory=punctual_loop) as runner:

@@ -22,6 +22,8 @@ from fusiond.state import (
     ACCEL_BIAS,
     ALIGNING,
     ATTITUDE,
+    CALIBRATIONS,
+    CHOOSING,
     FIRST_VELOCITY_N,
     FIX_E,
     FIX_VARIANCE,
@@ -34,7 +36,6 @@ from fusiond.state import (
     MEAN_FORCE_B,
     MEAN_RATE_B,
     MEAN_WEIGHT,
-    MOUNT_ERROR,
     NEVER,
     PHASE,
     POSITION,
@@ -43,7 +44,6 @@ from fusiond.state import (
     RATE_B,
     REST_RATE_B,
     RUNNING,
-    SCALE,
     T_CONSTRAINT,
     T_FIRST_VELOCITY,
     T_FIX,
@@ -63,6 +63,8 @@ WINDOW_LEAST_NS = SECOND  # the GNSS velocities that tell the vehicle's accelera
 WINDOW_MOST_NS = 3 * SECOND  # and at most so far
 REST_FRESH_NS = 600 * SECOND  # a standstill longer ago tells nothing of the gyro bias
 REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
+ALL_ROUND = 12  # hypotheses of an unknown heading
+BANK_SIGMA = math.radians(12.0)  # rad, of each: wide enough to overlap
 COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a careless mount
 
 
@@ -96,15 +98,21 @@ def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan
         auxiliary[FIX_E] = values[gnss_position.PLACE_E]
         auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
         stamps[T_FIX] = t_ns
-        speed = _gnss_speed(state)  # above the least speed of a course, the GNSS velocity starts the filter
-        if plan.filter.heading_deg is not None and _leveled(state) and not speed >= plan.filter.course_speed_mps:
-            variance = square(plan.filter.v_max_mps / 3)
-            if stamps[T_STILL] != NEVER and (plan.wheels or not math.isnan(speed)):
-                variance = plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE]
-            heading, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
-            _start(state, source, None, variance, (heading, sigma), plan)
+        _start_by_position(state, source, plan)
     elif model == MODEL["gnss_velocity"]:
         _gather_velocity(state, source, values, plan)
+
+
+def _start_by_position(state: FilterState, source: int, plan: Plan) -> None:
+    """Start at rest; or, where no GNSS velocity is to be had, in a motion that only its bound is known of."""
+    stamps, speed = state.stamps, _gnss_speed(state)
+    if not _leveled(state) or speed >= plan.filter.course_speed_mps:
+        return
+    rest = stamps[T_STILL] != NEVER and (plan.wheels or not math.isnan(speed))
+    if rest:
+        _start(state, source, None, plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, plan)
+    elif plan.filter.heading_deg is not None or not plan.velocities:
+        _start(state, source, None, square(plan.filter.v_max_mps / 3), None, plan)
 
 
 def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan) -> None:
@@ -117,14 +125,15 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
         return
     speed = math.sqrt(square(velocity_n[0]) + square(velocity_n[1]))
     fresh = stamps[T_FIX] != NEVER and stamps[T] - stamps[T_FIX] <= FIX_FRESH_NS
-    if window < WINDOW_LEAST_NS or speed < plan.filter.course_speed_mps or not fresh or not _leveled(state):
+    if window < WINDOW_LEAST_NS or not fresh or not _leveled(state):
         return
-    course = atan2(velocity_n[1], velocity_n[0])
-    variance = values[gnss_velocity.VARIANCE]
-    sigma = math.sqrt(variance / square(speed) + square(COURSE_SIGMA))
-    if plan.filter.heading_deg is not None:
-        course, sigma = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
-    _start(state, source, velocity_n, variance, (course, sigma), plan)
+    variance, course = values[gnss_velocity.VARIANCE], None
+    if speed >= plan.filter.course_speed_mps:
+        sigma = math.sqrt(variance / square(speed) + square(COURSE_SIGMA))
+        course = atan2(velocity_n[1], velocity_n[0]), sigma
+    elif stamps[T_STILL] != NEVER:
+        return  # the next position starts it
+    _start(state, source, velocity_n, variance, course, plan)
 
 
 def _gnss_speed(state: FilterState) -> float:
@@ -145,11 +154,37 @@ def _start(
     source: int,
     measured_n: Array | None,
     variance: float,
+    heading: tuple[float, float] | None,
+    plan: Plan,
+) -> None:
+    """Start from what was gathered: with a velocity (3,) [m/s], or None where it was not measured, and its variance; with
+    a heading and sigma [rad], a given one before a measured one; and where there is none, with a bank of hypotheses all
+    round."""
+    if plan.filter.heading_deg is not None:
+        heading = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
+    if heading is not None:
+        _place(state, source, measured_n, variance, heading, plan)
+        state.stamps[PHASE] = RUNNING
+    else:
+        state.bank[:] = 0.0
+        for i in range(ALL_ROUND):
+            turned = 2 * math.pi * i / ALL_ROUND, BANK_SIGMA
+            state.bank[i, 0] = 1 / ALL_ROUND
+            state.hypothesis(i).nominal[:] = state.nominal  # biases and calibrations of before
+            _place(state.hypothesis(i), source, measured_n, variance, turned, plan)
+        state.stamps[PHASE] = CHOOSING
+    state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
+
+
+def _place(
+    state: FilterState,
+    source: int,
+    measured_n: Array | None,
+    variance: float,
     heading: tuple[float, float],
     plan: Plan,
 ) -> None:
-    """Make the first state from what was gathered: velocity (3,) [m/s], nothing where it was not measured, with its
-    variance; heading and sigma [rad]."""
+    """Make the first state of one heading."""
     stamps, auxiliary, x = state.stamps, state.auxiliary, state.nominal
     yaw, yaw_sigma = heading
     to_n = mat_ne_from_trig(*geodetic_trig(*(float(c) for c in auxiliary[FIX_E])))
@@ -174,13 +209,11 @@ def _start(
     for block, sigma in (
         (GYRO_BIAS, min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma),
         (ACCEL_BIAS, plan.imu.accel_bias_sigma),
-        (SCALE, plan.filter.wheel_scale_sigma),
-        (MOUNT_ERROR, math.radians(plan.filter.mount_sigma_deg)),
     ):
         for i in range(block.start, block.stop):
             covariance[i, i] = square(sigma)
-    stamps[[T_START, T_CONSTRAINT, T_POSITION]] = stamps[T]
-    stamps[PHASE] = RUNNING
+    for i, first in enumerate(plan.calibration_variances, CALIBRATIONS):
+        covariance[i, i] = first
 
 
 def _level(state: FilterState, velocity_n: Array | None, yaw: float) -> tuple[float, float]:

@@ -21,8 +21,6 @@ import msgspec
 import zenoh
 import zenoh.ext
 
-from fusiond.config import Encoding
-from fusiond.config import Zenoh as ZenohSection
 from fusiond.messages import (
     ConfigMessage,
     HealthMessage,
@@ -33,6 +31,8 @@ from fusiond.messages import (
     decode,
 )
 from fusiond.publication import key
+from fusiond.sections import Encoding
+from fusiond.sections import Zenoh as ZenohSection
 from fusiond_adapters.outputs import Outbox
 from fusiond_adapters.zenoh import CONTENT_TYPES, KIND, STREAMS, PublishError, alive_key, open_session
 

@@ -37,10 +37,10 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Literal
 
-from fusiond.config import Config
 from fusiond.measurements import HOST_CLOCK, UNIX_CLOCK, ClockPair, Invalid, Measurement, Received
 from fusiond.offset_floor import OffsetFloor
 from fusiond.round_trips import RoundTrips
+from fusiond.sections import Config
 
 MILLISECOND = 1_000_000  # ns
 SECOND = 1_000 * MILLISECOND  # ns

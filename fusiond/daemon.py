@@ -18,11 +18,11 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Event, current_thread
 from typing import Any
 
-from fusiond.config import Config
 from fusiond.live import LiveEngine
 from fusiond.messages import EventMessage, HealthMessage, InputHealth, LatencyHealth, Message, OutputHealth, StateMessage
 from fusiond.publication import Surroundings, config_message, info_message
 from fusiond.reload import changes
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters import journal
 from fusiond_adapters.can_bus import CanBus

@@ -28,6 +28,7 @@ from fusiond.messages import StateMessage, csv_row
 from fusiond.progress import shown
 from fusiond.replay import Options, OutputError, replay
 from fusiond.report import Stretch, Summary
+from fusiond.sections import Config
 from fusiond_adapters.can_bus import CanBus
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.play import PlayedClock, Player
@@ -98,7 +99,7 @@ class Played:
     overtaken_ms: float  # how far a frame was overtaken on its way at the most, likewise
 
 
-def _settings(box: str) -> config.Config:
+def _settings(box: str) -> Config:
     """The drive's configuration, with live inputs of this machine and a black box."""
     settings = config.load(DRIVE / "fusiond.toml")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -113,7 +114,7 @@ def _settings(box: str) -> config.Config:
     )
 
 
-def _play(settings: config.Config, speed: float) -> Played:
+def _play(settings: Config, speed: float) -> Played:
     """Run a daemon while the drive is played to it. Raises OutputError where its inputs do not open."""
     states: list[StateMessage] = []
     port = int(next(iter(settings.mavlink.values())).connection.rpartition(":")[2])

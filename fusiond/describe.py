@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fusiond.config import Config, Gnss, Imu, Wheel
 from fusiond.measurements import Vector3
+from fusiond.sections import Config, Gnss, Imu, Wheel
 
 FAR_M = 20.0  # a lever arm beyond this is probably given in other units
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from fractions import Fraction
 
-from fusiond.config import Config
 from fusiond.fusion import Fusion, Receipt
 from fusiond.kernel import Outcome
 from fusiond.measurements import Received
 from fusiond.messages import OutcomeCounts, StateMessage, state_message
+from fusiond.sections import Config
 
 SECOND = 1_000_000_000  # ns
 LONGEST_SILENCE_NS = 60 * SECOND  # ticks go on for so long after an event; a longer hole is passed over

@@ -11,9 +11,9 @@ import numpy as np
 from msgspec import Struct
 
 from fusiond.clock import Clock
-from fusiond.config import Config, Imu
 from fusiond.earth import Array, geodetic, mat_ne
 from fusiond.estimate import Estimate, Mode, StateEstimate
+from fusiond.health import Belief, belief
 from fusiond.history import History
 from fusiond.kernel import Outcome
 from fusiond.measurements import ImuSample, Invalid, Measurement, Received
@@ -21,6 +21,7 @@ from fusiond.observe import MODELS
 from fusiond.observe.model import Unusable, within
 from fusiond.plan import IMU, SECOND, nanoseconds, plan, section_of
 from fusiond.rotation import matrix, product, quaternion
+from fusiond.sections import Config, Imu
 from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
@@ -41,6 +42,7 @@ from fusiond.state import (
     SCALE,
     T_IMU,
     T_POSITION,
+    T_START,
     VELOCITY,
     VELOCITY_E,
     WHEEL_SCALE,
@@ -121,6 +123,15 @@ class Fusion:
     def totals(self) -> dict[str, int]:
         """Counts of outcomes over all sources."""
         return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
+
+    def beliefs(self, t_ns: int) -> dict[str, Belief]:
+        """What each source is held to be at an instant (THEORY D1, D2)."""
+        head = self.history.head
+        start = int(head.stamps[T_START])
+        return {
+            source: belief(head.memory[i], head.source_stamps[i], t_ns, start if start != NEVER else t_ns)
+            for i, source in enumerate(self.plan.sources)
+        }
 
     def _values(self, measurement: Measurement) -> tuple[float, ...]:
         """A payload as a row of numbers. Raises Unusable."""

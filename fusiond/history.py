@@ -37,7 +37,7 @@ class History:
         self.plan = plan
         self.kernel = make_kernel(plan, compiled)
         self.index = {source: i for i, source in enumerate(plan.sources)}
-        self.head = FilterState(len(plan.sources))
+        self.head = FilterState(len(plan.sources), plan.size)
         self.counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
         self.rerun = 0  # rows run again because of a late event
         self._table: Rows = np.zeros(FIRST_ROWS, dtype=ROW)

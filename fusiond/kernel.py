@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond import alignment
+from fusiond import alignment, bank, health
 from fusiond.earth import Array, mat_ne
-from fusiond.motion import constrain, watch
-from fusiond.observe import MODELS, wheel_speed
-from fusiond.observe.model import CORRELATION, VALUES, Observation
+from fusiond.motion import carried, constrain, watch
+from fusiond.observe import MODELS, gnss_velocity, wheel_speed
+from fusiond.observe.model import CLUTTER, COMPANION, CORRELATION, NOISE_LEAST, NOISE_MOST, SHARED, VALUES, Observation
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
+    CHOOSING,
     EMPTY,
-    ERROR_SIZE,
     FORCE_B,
     HELD_FORCE_B,
     HELD_RATE_B,
@@ -41,6 +41,8 @@ from fusiond.state import (
     RATE_B,
     RESETS,
     RUNNING,
+    T_ALIKE,
+    T_BACK,
     T_FUSED,
     T_IMU,
     T_LAST,
@@ -48,11 +50,12 @@ from fusiond.state import (
     T_REJECTED,
     VELOCITY,
     VELOCITY_E,
+    WIDE_SIZE,
     FilterState,
     T,
 )
 from fusiond.strapdown import coast, propagate
-from fusiond.update import correlation_factor, update
+from fusiond.update import correlation_factor, update, whiten
 
 
 class Outcome(IntEnum):
@@ -83,14 +86,18 @@ ROW = np.dtype(
 )
 Rows = NDArray[Any]  # structured, of dtype ROW
 
+BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
+OUTAGE_NS = 10_000_000_000  # a source silent for longer, or not fused for longer before it was rejected, comes back anew
+SUSPECT = 6  # times gnss_reset_s, where the receiver's velocity is not trusted
+NEAR = 9.0  # test ratio up to which a fix after an outage is believed soon
+
 
 class Kernel:
     """The operations of the hot loop for one plan, on the memory that `attach` gives it. The history decides what to do
     when; this does it."""
 
-    def __init__(self, plan: Plan, size: int = ERROR_SIZE) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self.size = size
 
     def attach(
         self,
@@ -269,7 +276,9 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
             stamps[RESETS] += 1
         alignment.begin(state)
     row["outcome"] = Outcome.FUSED
-    if stamps[PHASE] != RUNNING:
+    if stamps[PHASE] == CHOOSING:
+        _choose(state, row, rows[following_imu] if following_imu < len(rows) else None, plan)
+    elif stamps[PHASE] != RUNNING:
         alignment.gather(state, t_ns, source, values, plan)
     else:
         advance(state, t_ns, rows[following_imu] if following_imu < len(rows) else None, plan)
@@ -290,7 +299,8 @@ def advance(state: FilterState, t_ns: int, imu: Any | None, plan: Plan) -> None:
     dt = (t_ns - begin) * 1e-9
     held = int(stamps[T_IMU])
     stamps[T] = t_ns
-    if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns:
+    frozen = not health.is_trusted(state.memory[plan.imu_source])
+    if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns or frozen:
         coast(state, dt, plan.noise)
         return
     span = float(imu["t_ns"] - held)
@@ -312,6 +322,8 @@ def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
     if t_ns <= begin or stamps[PHASE] != RUNNING:
         return
     carried = max(begin, min(t_ns, int(stamps[T_IMU]) + plan.imu_gap_ns))
+    if not health.is_trusted(state.memory[plan.imu_source]):
+        carried = begin
     if carried > begin:
         propagate(state, (carried - begin) * 1e-9, auxiliary[HELD_FORCE_B], auxiliary[HELD_RATE_B], plan.noise)
     if t_ns > carried:
@@ -319,39 +331,116 @@ def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
     stamps[T] = t_ns
 
 
+def _choose(state: FilterState, row: Any, imu: Any | None, plan: Plan) -> None:
+    """Take one event into every hypothesis of the bank."""
+    stamps, source, t_ns = state.stamps, int(row["source"]), int(row["t_ns"])
+    begin, model, values = stamps[T], plan.models[source], row["values"]
+    for i in bank.alive(state):
+        stamps[T] = begin
+        advance(state.hypothesis(i), t_ns, imu, plan)
+    stamps[T] = max(begin, t_ns)
+    if model == IMU:
+        _keep_sample(state, t_ns, values, plan)
+        bank.constrain(state, plan)
+        return
+    memory, own, parameters = state.memory[source], state.source_stamps[source], plan.parameters[source]
+    health.arrive(memory, own, values, t_ns)
+    remember(memory, model, values)
+    if model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan):
+        row["outcome"] = Outcome.REJECTED
+        return
+    factor = _factor(own, model, values, parameters, t_ns)
+    for i in bank.alive(state):
+        hypothesis = state.hypothesis(i)
+        seen = MODELS[model].observe(hypothesis, values, parameters)
+        assert seen is not None, "a source's model always observes"
+        seen, certain = seen._replace(variance=seen.variance * parameters[SHARED]), None
+        if model == MODEL["wheel_speed"]:
+            certain = wheel_speed.observe(hypothesis, values, parameters, certain=True)
+            certain = certain._replace(variance=certain.variance * parameters[SHARED])
+        bank.take(state, i, hypothesis, seen, plan.gates[len(seen.innovation)], factor, certain)
+    own[T_FUSED] = t_ns
+    if model == MODEL["gnss_position"]:
+        stamps[T_POSITION] = t_ns
+    bank.settle(state, plan)
+
+
+def remember(memory: Array, model: int, values: Array) -> None:
+    """What the motion detector wants to know of a source's last reading."""
+    if model == MODEL["wheel_speed"]:
+        memory[LAST_VALUE] = values[wheel_speed.SPEED]
+    elif model == MODEL["gnss_velocity"]:
+        memory[LAST_VALUE] = gnss_velocity.least_speed(values)
+
+
+def _factor(stamps: NDArray[np.int64], model: int, values: Array, parameters: Array, t_ns: int) -> float:
+    """How much less a reading is worth because its error is like that of the one before."""
+    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
+    return correlation_factor(interval, correlation(model, values, parameters))
+
+
+def correlation(model: int, values: Array, parameters: Array) -> float:
+    """Time [s] over which a reading's error stays alike."""
+    return float(values[wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION])
+
+
 def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
-    """Make an IMU sample the held one; let it tell of standstill; apply the constraints that are due."""
+    """Make an IMU sample the held one, and apply the constraints that are due."""
+    _keep_sample(state, t_ns, values, plan)
+    constrain(state, plan)
+
+
+def _keep_sample(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
+    """Make an IMU sample the held one; let it tell of standstill."""
     stamps, auxiliary = state.stamps, state.auxiliary
     dt = (t_ns - int(stamps[T_IMU])) * 1e-9 if stamps[T_IMU] != NEVER else 0.0
+    memory, own = state.memory[plan.imu_source], state.source_stamps[plan.imu_source]
+    same, _ = health.arrive(memory, own, values, t_ns)
+    health.judge_repetition(memory, own, same, t_ns)
     stamps[T_IMU] = t_ns
     auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = values[0:3]
     auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = values[3:6]
     watch(state, values[0:3], values[3:6], dt, plan)
-    constrain(state, plan)
 
 
 def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     """Judge and fuse one measurement at the state's own instant."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
-    model = plan.models[source]
+    model, values = plan.models[source], row["values"]
     parameters, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
-    if model == MODEL["wheel_speed"]:
-        memory[LAST_VALUE] = row["values"][0]
-    seen = MODELS[model].observe(state, row["values"], parameters)
+    same, elapsed = health.arrive(memory, stamps, values, t_ns)
+    remember(memory, model, values)
+    seen = MODELS[model].observe(state, values, parameters)
     assert seen is not None, "a source's model always observes"
-    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
-    correlation = row["values"][wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION]
-    factor = correlation_factor(interval, correlation)
     m = len(seen.innovation)
-    row["innovation"][:m] = seen.innovation
-    row["variance"][:m] = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian) + seen.variance
-    ratio, fused = update(state, seen, plan.gates[m], factor)
-    if not fused and _locked_out(stamps, t_ns, model, plan):
-        _reset_block(state, seen, model)
-        fused = True
+    predicted = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian)
+    given = seen.variance * parameters[SHARED]
+    learnt = given * health.noise_factor(memory, parameters[NOISE_LEAST], parameters[NOISE_MOST])
+    row["innovation"][:m], row["variance"][:m] = seen.innovation, predicted + learnt
+    factor = _factor(stamps, model, values, parameters, t_ns)
+    if stamps[T_LAST] == NEVER or t_ns - int(stamps[T_LAST]) > OUTAGE_NS:
+        stamps[T_FUSED], stamps[T_BACK] = NEVER, t_ns
+        health.begin(memory)
+    known = stamps[T_FUSED] != NEVER and health.tells(predicted, learnt)
+    if known and health.is_due(stamps, t_ns, correlation(model, values, parameters)):
+        whitened = whiten(state, seen._replace(variance=learnt))
+        if whitened is not None:
+            health.judge(memory, stamps, health.Judgement(whitened, same, t_ns))
+    health.learn(memory, (seen.innovation, given), predicted, elapsed)
+    companion = int(parameters[COMPANION])
+    trusted = health.is_trusted(memory) and (companion < 0 or health.is_trusted(state.memory[companion]))
+    trusted = trusted and not (model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan))
+    seen = seen._replace(variance=learnt * health.noisy_factor(memory))
+    ratio, fused = update(state, seen, plan.gates[m], factor, trusted, float(parameters[CLUTTER]))
     row["ratio"] = memory[LAST_RATIO] = ratio
     if fused:
-        stamps[T_FUSED], stamps[T_REJECTED] = t_ns, NEVER
+        stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
+    elif model != MODEL["wheel_speed"] and _locked_out(state, source, seen, t_ns, plan):
+        _reset_block(state, seen, model)
+        health.begin(memory)
+        fused = True
+    if fused:
+        stamps[T_FUSED] = t_ns
         if model == MODEL["gnss_position"]:
             state.stamps[T_POSITION] = t_ns
         return
@@ -360,10 +449,27 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
         stamps[T_REJECTED] = t_ns
 
 
-def _locked_out(stamps: NDArray[np.int64], t_ns: int, model: int, plan: Plan) -> bool:
-    """Whether a GNSS source has been rejected without a break for so long that the state is the more likely culprit."""
-    gnss = model in (MODEL["gnss_position"], MODEL["gnss_velocity"])
-    return gnss and stamps[T_REJECTED] != NEVER and t_ns - int(stamps[T_REJECTED]) >= plan.gnss_reset_ns
+def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, plan: Plan) -> bool:
+    """Whether a GNSS source has been rejected for so long, off alike all the time, that the state is the more likely
+    culprit: soon after an outage, later otherwise, and much later while the receiver contradicts itself."""
+    memory, stamps = state.memory[source], state.source_stamps[source]
+    gate = plan.gates[len(seen.innovation)]
+    off = health.moved(memory, seen.innovation, seen.variance, gate)
+    if off or stamps[T_ALIKE] == NEVER or t_ns - int(stamps[T_LAST]) > BREAK_NS:
+        stamps[T_ALIKE] = t_ns
+        return False
+    wait = plan.gnss_reset_ns
+    companion = int(plan.parameters[source, COMPANION])
+    if companion >= 0 and not health.is_trusted(state.memory[companion]):
+        wait = SUSPECT * wait
+    elif (
+        stamps[T_FUSED] == NEVER
+        or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS
+        or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
+    ):
+        near = memory[LAST_RATIO] <= NEAR
+        wait = plan.gnss_return_ns if near else wait
+    return t_ns - int(stamps[T_ALIKE]) >= wait
 
 
 def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
@@ -398,9 +504,11 @@ def compiled_available() -> bool:
     return find_spec("fusiond._kernel") is not None
 
 
-def make_kernel(plan: Plan, compiled: bool | None = None, size: int = ERROR_SIZE) -> AnyKernel:
+def make_kernel(plan: Plan, compiled: bool | None = None) -> AnyKernel:
     """The compiled kernel, or its twin where it was not built; `compiled` asks for one of the two. ImportError if the
     compiled one is asked for and was not built."""
     if compiled is None:
         compiled = compiled_available()
-    return import_module("fusiond._kernel").Kernel(plan, size) if compiled else Kernel(plan, size)
+    if not compiled:
+        return Kernel(plan)
+    return import_module("fusiond._kernel_wide" if plan.size == WIDE_SIZE else "fusiond._kernel").Kernel(plan)

@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping
 from operator import itemgetter
 from typing import Any, Protocol
 
-from fusiond.config import Config
 from fusiond.engine import Engine
 from fusiond.kernel import Outcome
 from fusiond.latency import RecentLatencies
 from fusiond.messages import Message, StateMessage
 from fusiond.publication import Publication, Surroundings
+from fusiond.sections import Config
 
 MICROSECOND = 1_000  # ns
 MOVED_NS = 100 * MICROSECOND  # less is only to tell apart frames that were read at once

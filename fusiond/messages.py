@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from fusiond.config import Encoding
 from fusiond.estimate import ATTITUDE, POSITION, VELOCITY, Estimate, Mode, StateEstimate
+from fusiond.sections import Encoding
 
 SCHEMA_VERSION = 1  # raised when a field changes its meaning, its unit or its type, or goes; not when one is added
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fusiond.earth import Array
 from fusiond.elementary import exp, square
+from fusiond.health import is_trusted
 from fusiond.observe import CONSTRAINTS
 from fusiond.plan import SECOND, Plan
 from fusiond.state import (
@@ -27,6 +28,8 @@ from fusiond.update import update
 
 MEAN_TIME = 0.5  # s, time constant of the exponential means
 MEAN_FILLED = 0.8  # weight from which a mean is used: 0.8 s after its begin
+GNSS_FRESH_NS = 2 * SECOND  # a GNSS velocity older than this tells nothing of being carried
+CARRIED = 1.0  # m/s: slower than this no vehicle is called carried
 WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer tells nothing of standing
 NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2
 
@@ -53,6 +56,17 @@ def watch(state: FilterState, force_b: Array, rate_b: Array, dt: float, plan: Pl
         state.stamps[T_STILL] = state.stamps[T]
 
 
+def carried(state: FilterState, wheel_speed: float, plan: Plan) -> bool:
+    """Whether a wheel at rest tells nothing, because the vehicle is carried or towed: GNSS sees it move."""
+    if abs(wheel_speed) > plan.motion.still_wheel_mps:
+        return False
+    for i in plan.velocities:
+        fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS
+        if fresh and state.memory[i, LAST_VALUE] > CARRIED and is_trusted(state.memory[i]):
+            return True
+    return False
+
+
 def stands(state: FilterState, plan: Plan) -> bool:
     """Whether this instant looks like standstill: a quiet IMU, and every fresh wheel at zero (at least one, if any is
     configured)."""
@@ -66,20 +80,34 @@ def stands(state: FilterState, plan: Plan) -> bool:
     fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
     if plan.wheels and not fresh:
         return False
-    return all(abs(state.memory[i, LAST_VALUE]) <= motion.still_wheel_mps for i in fresh)
+    if not all(abs(state.memory[i, LAST_VALUE]) <= motion.still_wheel_mps for i in fresh):
+        return False
+    return not carried(state, 0.0, plan)
 
 
 def constrain(state: FilterState, plan: Plan) -> None:
     """Apply the constraints that hold now, if the last round is an interval ago."""
-    now = state.stamps[T]
-    if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
-        return
-    state.stamps[T_CONSTRAINT] = now
-    still = state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns
+    still, rolling = constraints_due(state, plan)
     if still and _apply(state, ZERO_VELOCITY, plan, plan.zero_velocity_factor):  # rejected: it is a quiet drive
         _apply(state, ZERO_ROTATION, plan)
-    elif plan.motion.non_holonomic:
+    elif rolling:
         _apply(state, NON_HOLONOMIC, plan)
+
+
+def constraints_due(state: FilterState, plan: Plan) -> tuple[bool, bool]:
+    """Whether the vehicle stands, and whether its wheels keep it from going sideways, if it is time to look."""
+    now = state.stamps[T]
+    if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
+        return False, False
+    state.stamps[T_CONSTRAINT] = now
+    still = bool(state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns)
+    return still, plan.motion.non_holonomic and not _is_carried(state, plan)
+
+
+def _is_carried(state: FilterState, plan: Plan) -> bool:
+    """Whether every fresh wheel rests while GNSS sees the vehicle move: its body then goes where it is carried."""
+    fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
+    return bool(fresh) and all(carried(state, float(state.memory[i, LAST_VALUE]), plan) for i in fresh)
 
 
 def _apply(state: FilterState, which: int, plan: Plan, factor: float = 1.0) -> bool:

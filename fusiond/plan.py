@@ -8,11 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from fusiond.config import Config, Filter, Imu, Motion
 from fusiond.earth import Array
 from fusiond.elementary import square
-from fusiond.observe import CONSTRAINTS, MODELS
-from fusiond.observe.model import PARAMETERS
+from fusiond.observe import CONSTRAINTS, MODELS, wheel_speed
+from fusiond.observe.model import CLUTTER, COMPANION, NOISE_LEAST, NOISE_MOST, PARAMETERS, SHARED
+from fusiond.sections import Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
+from fusiond.state import (
+    ANTENNA_ERROR,
+    CALIBRATIONS,
+    DELAYS_ERROR,
+    ERROR_SIZE,
+    FURTHER_SCALES_ERROR,
+    MOUNT_ERROR,
+    SCALE,
+    WIDE_SIZE,
+)
 from fusiond.strapdown import ProcessNoise
 from fusiond.update import chi_square, correlation_factor
 
@@ -34,12 +44,18 @@ class Plan:
     constraints: Array  # (3, PARAMETERS): non-holonomic, zero velocity, zero rotation
     gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
     noise: ProcessNoise
+    size: int  # of the error state
+    calibration_variances: Array  # (size - CALIBRATIONS,): first ones
+    imu_source: int
     wheels: tuple[int, ...]  # indices of the sources that are wheels
+    velocities: tuple[int, ...]  # and of those that are GNSS velocities
     horizon_ns: int
     snapshot_interval_ns: int
     imu_gap_ns: int
     restart_gap_ns: int
     gnss_reset_ns: int
+    gnss_return_ns: int
+    heading_variance: float  # rad^2: the spread of the headings at which the bank is collapsed
     constraint_interval_ns: int
     still_after_ns: int
     still_gyro: float  # rad/s
@@ -65,10 +81,8 @@ def plan(config: Config) -> Plan:
             found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
     sources = tuple(sorted(found))
     models = tuple(found[source] for source in sources)
-    rows = [
-        np.zeros(PARAMETERS) if model == IMU else MODELS[model].parameters(section_of(source, model, config))
-        for source, model in zip(sources, models, strict=True)
-    ]
+    rows = [_parameters(source, sources, model, config) for source, model in zip(sources, models, strict=True)]
+    first, walks = _calibrations(config)
     (imu,) = config.imu.values()
     motion, settings = config.motion, config.filter
     return Plan(
@@ -82,15 +96,20 @@ def plan(config: Config) -> Plan:
             gyro=square(imu.gyro_noise),
             accel_bias=square(imu.accel_bias_walk),
             gyro_bias=square(imu.gyro_bias_walk),
-            scale=square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0,
-            mount=square(math.radians(settings.mount_walk_deg)) if settings.mount_sigma_deg else 0.0,
+            calibrations=tuple(walks.tolist()),
         ),
+        size=CALIBRATIONS + len(first),
+        calibration_variances=first,
+        imu_source=models.index(IMU),
         wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
+        velocities=tuple(i for i, model in enumerate(models) if model == MODEL["gnss_velocity"]),
         horizon_ns=nanoseconds(settings.horizon_s),
         snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
         imu_gap_ns=nanoseconds(settings.imu_gap_s),
         restart_gap_ns=nanoseconds(settings.restart_gap_s),
         gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
+        gnss_return_ns=nanoseconds(min(settings.gnss_return_s, settings.gnss_reset_s)),
+        heading_variance=square(math.radians(settings.heading_spread_deg)),
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),
         still_gyro=math.radians(motion.still_gyro_deg_s),
@@ -99,3 +118,55 @@ def plan(config: Config) -> Plan:
         motion=motion,
         imu=imu,
     )
+
+
+def _parameters(source: str, sources: tuple[str, ...], model: int, config: Config) -> Array:
+    """The row of one source: what its model wants, and what all have."""
+    if model == IMU:
+        return np.zeros(PARAMETERS)
+    section = section_of(source, model, config)
+    row = MODELS[model].parameters(section)
+    row[NOISE_LEAST], row[NOISE_MOST] = square(section.noise_least), square(section.noise_most)
+    row[SHARED], row[COMPANION] = _shared(section, model, config), -1
+    if model == MODEL["wheel_speed"]:
+        row[wheel_speed.SCALE_STATE] = _scale_state(wheel_groups(config)[source])
+        return row
+    row[CLUTTER] = section.outlier_share if section.outliers == "mixture" else 0.0
+    velocity = source.removesuffix(".position") + ".velocity"
+    if model == MODEL["gnss_position"] and velocity in sources:
+        row[COMPANION] = sources.index(velocity)
+    return row
+
+
+def _shared(section: Gnss | Wheel, model: int, config: Config) -> float:
+    """By what each variance s_i^2 of a group grows so that all of them, fused one by one, are worth no more than their
+    shared error s_c allows (THEORY A5): with 1 + s_c^2 sum 1 / s_j^2 they are worth s_c^2 + 1 / sum 1 / s_j^2 together."""
+    if section.group is None or model == MODEL["gnss_velocity"]:
+        return 1.0
+    if isinstance(section, Wheel):
+        sigmas = [wheel.sigma_mps for wheel in config.wheel.values() if wheel.group == section.group]
+        return 1 + square(section.shared_sigma_mps) * sum(1 / square(sigma) for sigma in sigmas)
+    sigmas = [gnss.position_sigma_m for gnss in config.gnss.values() if gnss.group == section.group]
+    return 1 + square(section.shared_sigma_m) * sum(1 / square(sigma) for sigma in sigmas)
+
+
+def _scale_state(group: int) -> int:
+    """The error state of a group's wheel scale."""
+    return SCALE.start if group == 0 else FURTHER_SCALES_ERROR.start + group - 1
+
+
+def _calibrations(config: Config) -> tuple[Array, Array]:
+    """First variances, and random walks squared, of the error states from CALIBRATIONS on: those that are frozen have
+    neither. Short where none of the wider state is wanted: it costs time."""
+    settings = config.filter
+    first, walks = np.zeros(WIDE_SIZE), np.zeros(WIDE_SIZE)
+    scales = [_scale_state(group) for group in {0, *wheel_groups(config).values()}]
+    first[scales] = square(settings.wheel_scale_sigma)
+    walks[scales] = square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0
+    first[MOUNT_ERROR] = square(math.radians(settings.mount_sigma_deg))
+    walks[MOUNT_ERROR] = square(math.radians(settings.mount_walk_deg)) if settings.mount_sigma_deg else 0.0
+    for gnss in filter(calibrated, config.gnss.values()):
+        first[ANTENNA_ERROR] = square(gnss.lever_arm_sigma_m)
+        first[DELAYS_ERROR] = square(gnss.delay_sigma_ms * 1e-3), square(gnss.velocity_delay_sigma_ms * 1e-3)
+    size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
+    return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

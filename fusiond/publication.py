@@ -17,7 +17,6 @@ import numpy as np
 
 from fusiond import __version__
 from fusiond.clock import ClockReport
-from fusiond.config import Config
 from fusiond.engine import FIELDS, RATE_DENOMINATOR, Engine, totals
 from fusiond.estimate import Mode
 from fusiond.fusion import Fusion, Receipt
@@ -44,6 +43,7 @@ from fusiond.messages import (
 )
 from fusiond.observe import MODELS
 from fusiond.plan import IMU
+from fusiond.sections import Config
 from fusiond.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
 
 SECOND = 1_000_000_000  # ns

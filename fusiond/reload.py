@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from fusiond.config import Config
+from fusiond.sections import Config
 from fusiond.toml_file import Section
 
 LIVE_MAVLINK = frozenset({"connection", "baud", "own_system", "own_component", "request", "timesync"})

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 from fusiond import __version__
 from fusiond.comparison import Comparison, Errors, Truth, TruthError, TruthRow, Window, errors_of, parse_truth
-from fusiond.config import Config
 from fusiond.engine import SECOND, Engine
 from fusiond.fusion import Receipt
 from fusiond.kernel import Outcome
@@ -29,6 +28,7 @@ from fusiond.messages import Message, StateMessage, csv_header, csv_row
 from fusiond.progress import shown
 from fusiond.publication import Publication
 from fusiond.report import DeadReckoningLog, Latencies, Publications, Span, Summary, source_report, to_json
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond.trace import Trace
 from fusiond_adapters.logs import LogError

@@ -21,9 +21,13 @@ VELOCITY_E = slice(3, 6)  # m/s, over ground, in earth-fixed axes
 QUATERNION_EB = slice(6, 10)  # body to earth-fixed
 GYRO_BIAS_B = slice(10, 13)  # rad/s
 ACCEL_BIAS_B = slice(13, 16)  # m/s^2
-WHEEL_SCALE = slice(16, 17)  # 1: what wheels read too much, shared by all
+WHEEL_SCALE = slice(16, 17)  # 1: what wheels read too much: those of the first group, which is all unless told otherwise
 MOUNT = slice(17, 19)  # rad: pitch and yaw of the IMU against the vehicle
-NOMINAL_SIZE = 19
+FURTHER_SCALES = slice(19, 22)  # 1: likewise, of the second to fourth group
+ANTENNA_B = slice(22, 25)  # m, what the antenna's lever arm is more than configured
+DELAYS = slice(25, 27)  # s, what the position's delay is more than configured, and the velocity's more than that
+HEIGHT_OFFSET = slice(27, 28)  # m, what the barometer reads too much
+NOMINAL_SIZE = 28
 
 # Error state: slices of a row or column of the covariance; true = nominal (+) error
 POSITION = slice(0, 3)  # m, e axes
@@ -34,6 +38,12 @@ ACCEL_BIAS = slice(12, 15)  # m/s^2, b axes
 SCALE = slice(15, 16)  # 1
 MOUNT_ERROR = slice(16, 18)  # rad
 ERROR_SIZE = 18
+FURTHER_SCALES_ERROR = slice(18, 21)  # 1; from here on only in a state of WIDE_SIZE
+ANTENNA_ERROR = slice(21, 24)  # m, b axes
+DELAYS_ERROR = slice(24, 26)  # s
+HEIGHT_OFFSET_ERROR = slice(26, 27)  # m
+WIDE_SIZE = 27
+CALIBRATIONS = 15  # error states from here on belong to the installation; their nominal states follow one higher
 
 # Auxiliary numbers: slices of FilterState.auxiliary
 HELD_FORCE_B = slice(0, 3)  # m/s^2, the newest inertial sample behind the state
@@ -53,9 +63,18 @@ CONSTRAINT_RATIO = slice(32, 35)  # last test ratios: non-holonomic, zero veloci
 AUXILIARY_SIZE = 35
 
 # Remembered of each source: columns of FilterState.memory
-LAST_VALUE = 0  # last reading, wheels only [m/s]
+LAST_VALUE = 0  # last reading of a wheel [m/s]; of a GNSS velocity, the least horizontal speed that it leaves possible
 LAST_RATIO = 1  # test ratio of the last update
-MEMORY_SIZE = 2
+NOISE_EXCESS = 2  # learnt variance over the configured one, less 1
+BELIEF = slice(3, 7)  # probabilities (fusiond.health); all 0 before the first look
+NOMINAL, NOISY, BIASED, FROZEN = 3, 4, 5, 6
+BIAS = slice(7, 10)  # whitened innovation that a biased source would have
+BIAS_VARIANCE = 10
+LAST_SUM = 11  # of the last reading's numbers: tells a repeated one
+INTERVAL = 12  # s, mean spacing of the events
+LAST_INNOVATION = slice(13, 16)  # of the last rejection
+MEAN_NIS = 16  # normalised innovation squared per axis, mean
+MEMORY_SIZE = 17
 
 # Stamps and counts: indices of FilterState.stamps
 T = 0  # ns, instant of the state
@@ -67,7 +86,7 @@ T_FIRST_VELOCITY = 5  # ns, begin of the alignment window
 T_FIX = 6  # ns, of FIX_E
 T_REST = 7  # ns, end of the standstill that REST_RATE_B is the mean of
 T_START = 8  # ns, when the filter began to run
-PHASE = 9  # EMPTY, ALIGNING, RUNNING
+PHASE = 9  # EMPTY, ALIGNING, RUNNING, CHOOSING
 RESETS = 10  # count of jumps of the state
 CONSTRAINT_FUSED = slice(11, 14)  # counts: non-holonomic, zero velocity, zero rotation
 CONSTRAINT_REJECTED = slice(14, 17)
@@ -78,31 +97,59 @@ STAMPS_SIZE = 18
 T_LAST = 0  # ns, of its last event
 T_FUSED = 1  # ns, of its last event fused
 T_REJECTED = 2  # ns, of the first of an unbroken row of rejections; NEVER if there is none
-SOURCE_STAMPS_SIZE = 3
+T_JUDGED = 3  # ns, of the last look at its health
+T_ALIKE = 4  # ns, since when its rejected readings are off alike; NEVER if there is none
+T_BACK = 5  # ns, since when it is heard again after an outage, or for the first time
+SOURCE_STAMPS_SIZE = 6
 
-EMPTY, ALIGNING, RUNNING = 0, 1, 2
+EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
+HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.bank): twelve all round, and a stored one
 NEVER = -(2**62)
 
 
 class FilterState:
     """Views of the two arrays. `copy_from` and `copy` are the snapshot."""
 
-    __slots__ = ("auxiliary", "covariance", "memory", "nominal", "numbers", "size", "source_stamps", "stamps", "whole")
+    __slots__ = (
+        "auxiliary",
+        "bank",
+        "covariance",
+        "memory",
+        "nominal",
+        "numbers",
+        "size",
+        "source_stamps",
+        "stamps",
+        "whole",
+    )
 
     def __init__(self, sources: int, size: int = ERROR_SIZE) -> None:
         """An empty state for a number of sources and of error states."""
         self.size = size
-        ends = np.cumsum([NOMINAL_SIZE, size * size, AUXILIARY_SIZE, sources * MEMORY_SIZE])
+        block = 1 + NOMINAL_SIZE + size * size
+        sizes = [NOMINAL_SIZE, size * size, AUXILIARY_SIZE, sources * MEMORY_SIZE, HYPOTHESES * block]
+        ends = np.cumsum(sizes)
         self.numbers: Array = np.zeros(int(ends[-1]))
         self.nominal: Array = self.numbers[: ends[0]]
         self.covariance: Array = self.numbers[ends[0] : ends[1]].reshape(size, size)
         self.auxiliary: Array = self.numbers[ends[1] : ends[2]]
-        self.memory: Array = self.numbers[ends[2] :].reshape(sources, MEMORY_SIZE)
+        self.memory: Array = self.numbers[ends[2] : ends[3]].reshape(sources, MEMORY_SIZE)
+        self.bank: Array = self.numbers[ends[3] :].reshape(HYPOTHESES, block)  # weight, nominal, covariance of each
         self.whole: Stamps = np.full(STAMPS_SIZE + sources * SOURCE_STAMPS_SIZE, NEVER, dtype=np.int64)
         self.stamps: Stamps = self.whole[:STAMPS_SIZE]
         self.source_stamps: Stamps = self.whole[STAMPS_SIZE:].reshape(sources, SOURCE_STAMPS_SIZE)
         self.stamps[PHASE:] = 0
         self.nominal[QUATERNION_EB.start] = 1.0
+
+    def hypothesis(self, number: int) -> FilterState:
+        """A view of one hypothesis as a state: nominal and covariance are its own, the rest is shared."""
+        view = FilterState.__new__(FilterState)
+        view.size, view.numbers, view.whole, view.bank = self.size, self.numbers, self.whole, self.bank
+        view.auxiliary, view.memory, view.stamps = self.auxiliary, self.memory, self.stamps
+        view.source_stamps = self.source_stamps
+        view.nominal = self.bank[number, 1 : 1 + NOMINAL_SIZE]
+        view.covariance = self.bank[number, 1 + NOMINAL_SIZE :].reshape(self.size, self.size)
+        return view
 
     def copy_from(self, other: FilterState) -> None:
         self.numbers[:] = other.numbers

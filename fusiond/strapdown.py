@@ -19,20 +19,19 @@ from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
     ATTITUDE,
+    CALIBRATIONS,
     GYRO_BIAS,
     GYRO_BIAS_B,
-    MOUNT_ERROR,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
-    SCALE,
     VELOCITY,
     VELOCITY_E,
     FilterState,
 )
 
 COAST_ACCEL = 2.0  # m/s^2/sqrt(Hz): what a vehicle may do while the inertial sensor is silent
-COAST_RATE = 0.2  # rad/s/sqrt(Hz)
+COAST_RATE = 0.5  # rad/s/sqrt(Hz): a car in a bend
 LONGEST_STEP = 0.05  # s: longer intervals are propagated in equal parts
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
 EARTH_RATE_SKEW = skew(EARTH_RATE_E)
@@ -45,8 +44,7 @@ class ProcessNoise(NamedTuple):
     gyro: float  # (rad/s)^2/Hz
     accel_bias: float  # (m/s^2)^2/s
     gyro_bias: float  # (rad/s)^2/s
-    scale: float  # 1/s
-    mount: float  # rad^2/s
+    calibrations: tuple[float, ...]  # of the error states from CALIBRATIONS on, per second
 
 
 def propagate(state: FilterState, dt: float, force_b: Array, rate_b: Array, noise: ProcessNoise) -> None:
@@ -114,11 +112,11 @@ def _grow(state: FilterState, phi: Array, dt: float, accel: float, gyro: float, 
         (ATTITUDE, gyro),
         (ACCEL_BIAS, noise.accel_bias),
         (GYRO_BIAS, noise.gyro_bias),
-        (SCALE, noise.scale),
-        (MOUNT_ERROR, noise.mount),
     ):
         for i in range(block.start, block.stop):
             covariance[i, i] += density * dt
+    for i, density in enumerate(noise.calibrations, CALIBRATIONS):
+        covariance[i, i] += density * dt
     for i in range(3):
         covariance[POSITION.start + i, VELOCITY.start + i] += accel * dt * dt / 2
         covariance[VELOCITY.start + i, POSITION.start + i] += accel * dt * dt / 2

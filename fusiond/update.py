@@ -14,17 +14,14 @@ from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
     ATTITUDE,
+    CALIBRATIONS,
     GYRO_BIAS,
     GYRO_BIAS_B,
-    MOUNT,
-    MOUNT_ERROR,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
-    SCALE,
     VELOCITY,
     VELOCITY_E,
-    WHEEL_SCALE,
     FilterState,
 )
 
@@ -33,9 +30,12 @@ ADDED = (
     (VELOCITY_E, VELOCITY),
     (GYRO_BIAS_B, GYRO_BIAS),
     (ACCEL_BIAS_B, ACCEL_BIAS),
-    (WHEEL_SCALE, SCALE),
-    (MOUNT, MOUNT_ERROR),
 )
+
+
+FIELD = 100.0  # sigmas: how wide the field is that clutter is uniform over
+UNIFORM = math.sqrt(2 * math.pi) / FIELD  # its density per axis, in units of N(0; 0, S)
+NEGLIGIBLE = 1e-6  # a reading less likely than this to be the target's changes nothing
 
 
 def chi_square(probability: float, freedom: int) -> float:
@@ -70,8 +70,8 @@ def correlation_factor(interval: float, correlation: float) -> float:
     return (1 + alike) / (1 - alike) if alike < 1 else math.inf
 
 
-def solve_spd(matrix: Array, right: Array) -> Array | None:
-    """matrix^-1 right for a finite, symmetric positive definite matrix (m, m), by Cholesky; None where it is not."""
+def cholesky(matrix: Array) -> Array | None:
+    """Lower factor (m, m) of a finite, symmetric positive definite matrix; None where it is not."""
     m = len(matrix)
     lower = np.zeros((m, m))
     for i in range(m):
@@ -83,6 +83,12 @@ def solve_spd(matrix: Array, right: Array) -> Array | None:
                 lower[i, i] = math.sqrt(rest)
             else:
                 lower[i, j] = rest / lower[j, j]
+    return lower
+
+
+def solve(lower: Array, right: Array) -> Array:
+    """(lower lower')^-1 right, (m, k)."""
+    m = len(lower)
     solution = right.copy()
     for i in range(m):
         solution[i] = (solution[i] - lower[i, :i] @ solution[:i]) / lower[i, i]
@@ -91,34 +97,70 @@ def solve_spd(matrix: Array, right: Array) -> Array | None:
     return solution
 
 
-def update(state: FilterState, seen: Observation, gate: float, factor: float = 1.0) -> tuple[float, bool]:
-    """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1. Returns the ratio (infinite where S is not
-    positive definite, a variance negative or anything not finite) and whether it was fused.
+def whiten(state: FilterState, seen: Observation) -> Array | None:
+    """Innovation (m,) in units of its own sigma, L^-1 d with L L' = H P H' + R; None where that is not positive definite."""
+    lower = cholesky(seen.jacobian @ state.covariance @ seen.jacobian.T + np.diag(seen.variance))
+    if lower is None:
+        return None
+    whitened = seen.innovation.copy()
+    for i in range(len(whitened)):
+        whitened[i] = (whitened[i] - lower[i, :i] @ whitened[:i]) / lower[i, i]
+    return whitened
+
+
+def update(
+    state: FilterState,
+    seen: Observation,
+    gate: float,
+    factor: float = 1.0,
+    trusted: bool = True,
+    clutter: float = 0.0,
+) -> tuple[float, bool]:
+    """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1, or it is not trusted. Returns the ratio
+    (infinite where S is not positive definite, a variance negative or anything not finite) and whether it was fused.
 
     It is judged by its own variance, and weighed by `factor` times that: a sample whose error it shares with the ones
-    before tells little, but is no less wrong when it is far off.
+    before tells little, but is no less wrong when it is far off. With `clutter`, the share of readings that are anywhere,
+    there is no gate: see `detection`.
     """
     innovation, jacobian, variance = seen
     if not (variance >= 0).all():
         return math.inf, False
     across = state.covariance @ jacobian.T
     predicted = jacobian @ across
-    judged = solve_spd(predicted + np.diag(variance), innovation.reshape(-1, 1))
-    if judged is None:
+    lower = cholesky(predicted + np.diag(variance))
+    if lower is None:
         return math.inf, False
-    ratio = float(innovation @ judged[:, 0]) / gate
-    if not ratio <= 1:
-        return ratio if ratio > 1 else math.inf, False
+    distance = float(innovation @ solve(lower, innovation.reshape(-1, 1))[:, 0])
+    ratio = distance / gate if distance / gate < math.inf else math.inf
+    if clutter == 0 or ratio == math.inf:
+        share = 1.0 if ratio <= 1 else 0.0
+    else:
+        share = detection(distance, len(innovation), clutter)
     variance = factor * variance
-    solved = solve_spd(predicted + np.diag(variance), across.T)
-    if solved is None:
-        return math.inf, False
-    gain = solved.T
+    lower = cholesky(predicted + np.diag(variance))
+    if not trusted or share < NEGLIGIBLE or lower is None:
+        return ratio, False
+    gain = solve(lower, across.T).T
     keep = np.eye(state.size) - gain @ jacobian
     covariance = keep @ state.covariance @ keep.T + (gain * variance) @ gain.T
+    error = gain @ innovation
+    if share < 1:
+        covariance = share * covariance + (1 - share) * state.covariance + share * (1 - share) * np.outer(error, error)
+        error = share * error
     state.covariance[:] = (covariance + covariance.T) / 2
-    inject(state, gain @ innovation)
-    return ratio, True
+    inject(state, error)
+    return ratio, share >= 0.5
+
+
+def detection(distance: float, m: int, clutter: float) -> float:
+    """Probability that a reading is the target's and not clutter (THEORY D3): P_D N(d; 0, S) against (1 - P_D) rho, with
+    P_D = 1 - clutter and rho uniform over a field of `FIELD` sigmas along each axis of S. The update is then the mixture
+    of updated and predicted state, collapsed by its moments (B6)."""
+    density, uniform = (1 - clutter) * exp(-distance / 2), clutter
+    for _ in range(m):
+        uniform *= UNIFORM
+    return density / (density + uniform)
 
 
 def inject(state: FilterState, error: Array) -> None:
@@ -127,4 +169,5 @@ def inject(state: FilterState, error: Array) -> None:
     x = state.nominal
     for nominal, block in ADDED:
         x[nominal] += error[block]
+    x[CALIBRATIONS + 1 : state.size + 1] += error[CALIBRATIONS:]
     x[QUATERNION_EB] = normalised(quaternion_multiply(quaternion_exp(error[ATTITUDE]), x[QUATERNION_EB]))

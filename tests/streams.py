@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fusiond.config import Config
 from fusiond.earth import EARTH_RATE, Array, ecef, geodetic, gravity_e, mat_ne, radii
 from fusiond.fusion import Fusion
 from fusiond.kernel import ROW, Outcome
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.rotation import matrix_from_euler, quaternion
-from fusiond.state import PHASE, POSITION_E, QUATERNION_EB, RUNNING, VELOCITY_E, FilterState, T
+from fusiond.sections import Config
+from fusiond.state import ERROR_SIZE, PHASE, POSITION_E, QUATERNION_EB, RUNNING, VELOCITY_E, FilterState, T
 
 MS = 1_000_000  # ns
 SECOND = 1_000 * MS
@@ -128,7 +128,7 @@ def measurements(
         return strength * sigma * rng.standard_normal(size)
 
     for k in range(len(truth.seconds)):
-        shaken = 1.0 if truth.speed[k] > 0.1 else 0.1
+        shaken = 1.0 if abs(truth.speed[k]) > 0.1 else 0.1
         force = truth.force_b[k] + shaken * noise(0.05 / math.sqrt(step)) + accel_bias
         rate = truth.rate_b[k] + shaken * noise(0.002 / math.sqrt(step)) + gyro_bias
         add("imu0", k, k, ImuSample(triple(force), triple(rate)))
@@ -140,7 +140,7 @@ def measurements(
         add("gps0.velocity", k, i, GnssVelocity(north, east, down, 0.1))
     for place, name in enumerate(wheels):
         for i, k in enumerate(range(place, len(truth.seconds) - 1, round(1 / wheel_hz / step))):
-            reading = abs(float(truth.speed[k] + noise(0.05, 1)[0])) if truth.speed[k] > 0.1 else 0.0
+            reading = abs(float(truth.speed[k] + noise(0.05, 1)[0])) if abs(truth.speed[k]) > 0.1 else 0.0
             add(name, k, i, WheelSpeed(reading), round(step * 1e9) // 4 * (place % 3))
     return sorted(events, key=lambda event: event.key)
 
@@ -157,17 +157,22 @@ def fuse(configuration: Config, events: Iterable[Measurement], compiled: bool | 
     return fusion
 
 
-def running_state(rng: np.random.Generator, sources: int = 7, start: tuple[float, float, float] = MUNICH) -> FilterState:
+def running_state(
+    rng: np.random.Generator,
+    sources: int = 7,
+    start: tuple[float, float, float] = MUNICH,
+    size: int = ERROR_SIZE,
+) -> FilterState:
     """A running filter state with everything at random sizes that occur, and a full covariance."""
-    state = FilterState(sources)
-    x = state.nominal
+    state = FilterState(sources, size)
+    x = state.nominal[: size + 1]
     x[:] = rng.normal(0.0, 0.01, len(x))
     x[POSITION_E] = ecef(*start) + rng.normal(0.0, 100.0, 3)
     x[VELOCITY_E] = rng.normal(0.0, 10.0, 3)
     x[QUATERNION_EB] = quaternion(matrix_from_euler(*(float(a) for a in rng.uniform(-1.5, 1.5, 3))))
     root = rng.normal(0.0, 1.0, (state.size, state.size)) + 2 * np.eye(state.size)
-    scale = np.repeat([1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3], [3, 3, 3, 3, 3, 3])
-    covariance = scale[:, None] * (root @ root.T) * scale / 18
+    scale = np.repeat([1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])[:size]
+    covariance = scale[:, None] * (root @ root.T) * scale / size
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)
     state.auxiliary[[2, 8]] -= 9.8

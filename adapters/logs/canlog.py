@@ -29,8 +29,8 @@ from typing import NamedTuple
 import can
 from can.io.blf import BLFParseError
 
-from fusiond.config import Config
 from fusiond.measurements import Received
+from fusiond.sections import Config
 
 from ..can import PDU2, CanDecoder, frame_key, parameter_group
 from . import LogError, LogInput

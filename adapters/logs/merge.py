@@ -10,8 +10,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
-from fusiond.config import Config
 from fusiond.measurements import Received
+from fusiond.sections import Config
 
 from ..can import CanDecoder
 from ..mavlink import MavlinkDecoder

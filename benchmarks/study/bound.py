@@ -11,12 +11,12 @@ import numpy as np
 
 from benchmarks.study.runs import start_covariance, true_state
 from benchmarks.study.world import WHEEL_PHASE_S, World
-from fusiond.config import Config
 from fusiond.earth import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array
 from fusiond.elementary import square
 from fusiond.observe import CONSTRAINTS, MODELS
 from fusiond.plan import IMU, MODEL, plan
 from fusiond.rotation import quaternion, skew
+from fusiond.sections import Config
 from fusiond.state import (
     ACCEL_BIAS,
     ATTITUDE,

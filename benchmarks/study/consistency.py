@@ -17,10 +17,10 @@ from benchmarks.study.bound import Bound
 from benchmarks.study.report import Section, figure
 from benchmarks.study.runs import BLOCKS, Ledger, drive, error, started
 from benchmarks.study.world import Sensors, World
-from fusiond.config import Config
 from fusiond.earth import Array
 from fusiond.fusion import Fusion
 from fusiond.plan import IMU
+from fusiond.sections import Config
 from fusiond.state import CONSTRAINT_RATIO, ERROR_SIZE
 
 WHEEL_HZ = 50.0

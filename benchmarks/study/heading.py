@@ -10,9 +10,9 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section
 from benchmarks.study.runs import drive
 from benchmarks.study.world import T0, Sensors, World
-from fusiond.config import Config
 from fusiond.fusion import Fusion
 from fusiond.plan import nanoseconds
+from fusiond.sections import Config
 
 LOOK_S = 0.1
 GOOD = np.radians(5.0)

@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.config import Config, Wheel
 from fusiond.earth import ECCENTRICITY2, Array
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
+from fusiond.sections import Config, Wheel
 from fusiond.simulation import imu as inertial_sensor
 from fusiond.simulation import wgs84
 from fusiond.simulation.gnss import gauss_markov

@@ -6,13 +6,35 @@ import math
 
 import numpy as np
 
-from fusiond.config import Gnss
 from fusiond.earth import Array, ecef, mat_ne
 from fusiond.elementary import square
 from fusiond.measurements import GnssPosition
-from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, Observation, Unusable, mat_eb, within
+from fusiond.observe.model import (
+    CALIBRATED,
+    CORRELATION,
+    LEVER_ARM_B,
+    PARAMETERS,
+    Observation,
+    Unusable,
+    mat_eb,
+    rate_b,
+    within,
+)
 from fusiond.rotation import skew
-from fusiond.state import ATTITUDE, POSITION, POSITION_E, FilterState
+from fusiond.sections import Gnss, calibrated
+from fusiond.state import (
+    ANTENNA_B,
+    ANTENNA_ERROR,
+    ATTITUDE,
+    DELAYS,
+    DELAYS_ERROR,
+    GYRO_BIAS,
+    POSITION,
+    POSITION_E,
+    VELOCITY,
+    VELOCITY_E,
+    FilterState,
+)
 
 PLACE_E = slice(0, 3)  # m, values
 VARIANCE_HORIZONTAL, VARIANCE_VERTICAL = 3, 4  # m^2, values
@@ -24,6 +46,7 @@ def parameters(gnss: Gnss) -> Array:
     row = np.zeros(PARAMETERS)
     row[LEVER_ARM_B] = gnss.lever_arm_m
     row[CORRELATION] = gnss.position_correlation_s
+    row[CALIBRATED] = float(calibrated(gnss))
     return row
 
 
@@ -40,12 +63,31 @@ def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
 
 
 def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
-    """Innovation (3,) [m], north-east-down."""
+    """Innovation (3,) [m], north-east-down. A delay that is a state takes the antenna back along its velocity."""
     to_n = mat_ne(state.nominal[POSITION_E])
     lever_e = mat_eb(state) @ parameter[LEVER_ARM_B]
     jacobian = np.zeros((3, state.size))
     jacobian[:, POSITION] = to_n
+    if parameter[CALIBRATED]:
+        lever_e = _calibrated(state, parameter[LEVER_ARM_B], to_n, jacobian)
     jacobian[:, ATTITUDE] = -to_n @ skew(lever_e)
     horizontal, vertical = row[VARIANCE_HORIZONTAL], row[VARIANCE_VERTICAL]
     innovation = to_n @ (row[PLACE_E] - state.nominal[POSITION_E] - lever_e)
+    if parameter[CALIBRATED]:
+        innovation += to_n @ state.nominal[VELOCITY_E] * state.nominal[DELAYS.start]
     return Observation(innovation, jacobian, np.array([horizontal, horizontal, vertical]))
+
+
+def _calibrated(state: FilterState, lever_b: Array, to_n: Array, jacobian: Array) -> Array:
+    """The antenna from the IMU (3,) [m, e axes] where lever arm and delay are states, but for the way that the IMU itself
+    goes in the delay; fills the jacobian's columns of lever arm, delay, velocity and gyro bias."""
+    x = state.nominal
+    rotation, rate, delay = mat_eb(state), rate_b(state), float(x[DELAYS.start])
+    lever_b = lever_b + x[ANTENNA_B]
+    swing_b = np.cross(rate, lever_b)
+    turned = to_n @ rotation
+    jacobian[:, VELOCITY] = to_n * -delay
+    jacobian[:, GYRO_BIAS] = turned @ skew(lever_b) * -delay
+    jacobian[:, ANTENNA_ERROR] = turned - turned @ skew(rate) * delay
+    jacobian[:, DELAYS_ERROR.start] = -(to_n @ x[VELOCITY_E] + turned @ swing_b)
+    return rotation @ (lever_b - swing_b * delay)

@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from fusiond.config import Gnss
-from fusiond.earth import Array, mat_ne
+from fusiond.earth import Array, gravity_e, mat_ne
 from fusiond.elementary import square
 from fusiond.measurements import GnssVelocity
-from fusiond.observe.model import CORRELATION, LEVER_ARM_B, PARAMETERS, SPEED_LIMIT, Observation, mat_eb, rate_b, within
+from fusiond.observe.model import (
+    CALIBRATED,
+    CORRELATION,
+    LEVER_ARM_B,
+    PARAMETERS,
+    SPEED_LIMIT,
+    Observation,
+    mat_eb,
+    rate_b,
+    within,
+)
 from fusiond.rotation import skew
-from fusiond.state import ATTITUDE, GYRO_BIAS, POSITION_E, VELOCITY, VELOCITY_E, FilterState
+from fusiond.sections import Gnss, calibrated
+from fusiond.state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_B,
+    ANTENNA_B,
+    ANTENNA_ERROR,
+    ATTITUDE,
+    DELAYS,
+    DELAYS_ERROR,
+    FORCE_B,
+    GYRO_BIAS,
+    POSITION_E,
+    VELOCITY,
+    VELOCITY_E,
+    FilterState,
+)
+from fusiond.strapdown import EARTH_RATE_SKEW
 
 VELOCITY_N = slice(0, 3)  # m/s, values
 VARIANCE = 3  # (m/s)^2, values
@@ -21,6 +48,7 @@ def parameters(gnss: Gnss) -> Array:
     row = np.zeros(PARAMETERS)
     row[LEVER_ARM_B] = gnss.lever_arm_m
     row[CORRELATION] = gnss.velocity_correlation_s
+    row[CALIBRATED] = float(calibrated(gnss))
     return row
 
 
@@ -33,15 +61,41 @@ def values(velocity: GnssVelocity, gnss: Gnss) -> tuple[float, ...]:
     return velocity.north, velocity.east, velocity.down, variance, 3.0
 
 
+def least_speed(row: Array) -> float:
+    """The least horizontal speed [m/s] that a reading leaves possible: three sigmas below it."""
+    return math.sqrt(row[0] * row[0] + row[1] * row[1]) - 3 * math.sqrt(row[VARIANCE])
+
+
 def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
-    """Innovation (2,) or (3,) [m/s], north-east(-down)."""
+    """Innovation (2,) or (3,) [m/s], north-east(-down). A delay that is a state takes the velocity back along the
+    acceleration; what the lever arm swings is taken as constant over it."""
     axes = int(row[AXES])
     to_n = mat_ne(state.nominal[POSITION_E])[:axes]
     rotation = mat_eb(state)
-    swing_e = rotation @ np.cross(rate_b(state), parameter[LEVER_ARM_B])
+    lever_b = parameter[LEVER_ARM_B]
+    if parameter[CALIBRATED]:
+        lever_b = lever_b + state.nominal[ANTENNA_B]
+    swing_e = rotation @ np.cross(rate_b(state), lever_b)
     jacobian = np.zeros((axes, state.size))
     jacobian[:, VELOCITY] = to_n
-    jacobian[:, ATTITUDE] = -to_n @ skew(swing_e)
-    jacobian[:, GYRO_BIAS] = to_n @ rotation @ skew(parameter[LEVER_ARM_B])
+    jacobian[:, GYRO_BIAS] = to_n @ rotation @ skew(lever_b)
+    if parameter[CALIBRATED]:
+        swing_e = swing_e - _gained(state, to_n, rotation, jacobian)
+    jacobian[:, ATTITUDE] -= to_n @ skew(swing_e)
     innovation = row[VELOCITY_N][:axes] - to_n @ (state.nominal[VELOCITY_E] + swing_e)
     return Observation(innovation, jacobian, np.full(axes, row[VARIANCE]))
+
+
+def _gained(state: FilterState, to_n: Array, rotation: Array, jacobian: Array) -> Array:
+    """The velocity (3,) [m/s, e axes] that was gained since the delay began; fills the jacobian's columns of lever arm,
+    delays, velocity and accelerometer bias, and what of the attitude's does not turn with the specific force."""
+    x = state.nominal
+    delay = float(x[DELAYS.start] + x[DELAYS.start + 1])
+    force_e = rotation @ (state.auxiliary[FORCE_B] - x[ACCEL_BIAS_B])
+    rest = gravity_e(x[POSITION_E]) - 2 * EARTH_RATE_SKEW @ x[VELOCITY_E]
+    jacobian[:, VELOCITY] += to_n @ EARTH_RATE_SKEW * (2 * delay)
+    jacobian[:, ACCEL_BIAS] = to_n @ rotation * delay
+    jacobian[:, ANTENNA_ERROR] = to_n @ rotation @ skew(rate_b(state))
+    jacobian[:, DELAYS_ERROR] = np.outer(-to_n @ (force_e + rest), np.ones(2))
+    jacobian[:, ATTITUDE] = -to_n @ skew(rest) * delay
+    return (force_e + rest) * delay

@@ -28,11 +28,15 @@ from fusiond.state import (
 )
 
 VALUES = 8  # width of a measurement's row
-PARAMETERS = 12  # width of a source's row
+PARAMETERS = 16  # width of a source's row
 SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
 LEVER_ARM_B = slice(0, 3)  # parameters that models share: m, the sensor from the IMU
 CORRELATION = 3  # s, over which the sensor's errors stay alike
-
+NOISE_LEAST, NOISE_MOST = 8, 9  # learnt variance over the configured one: its bounds
+SHARED = 10  # by what an error shared with others of a group multiplies the variance
+COMPANION = 11  # place of the source that must be trusted as well, or -1
+CLUTTER = 12  # share of readings that are anywhere; 0: the gate decides
+CALIBRATED = 4  # 1 where lever arm and delays of this receiver are states of the filter
 
 
 class Unusable(Exception):

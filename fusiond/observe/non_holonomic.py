@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.config import Motion
 from fusiond.earth import Array
 from fusiond.elementary import square
 from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
+from fusiond.sections import Motion
 from fusiond.state import FilterState
 
 LATERAL_VARIANCE, VERTICAL_VARIANCE = 3, 4  # (m/s)^2, parameters

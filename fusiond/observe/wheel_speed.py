@@ -10,15 +10,16 @@ import math
 
 import numpy as np
 
-from fusiond.config import Wheel
 from fusiond.earth import Array
 from fusiond.elementary import exp, square
 from fusiond.measurements import WheelSpeed
 from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, SPEED_LIMIT, Observation, point_velocity_v, within
-from fusiond.state import SCALE, WHEEL_SCALE, FilterState
+from fusiond.sections import Wheel
+from fusiond.state import SCALE, FilterState
 
 SPEED, VARIANCE, ALIKE = 0, 1, 2  # m/s, (m/s)^2, s over which errors stay alike: values
 STEERED, UNSIGNED = 4, 5  # parameters: 1 or 0
+SCALE_STATE = 6  # parameters: the error state of its scale; the nominal state is one higher
 SLOW_ALIKE = 1.0  # s: for so long at least a slow wheel is slow alike
 SURE_SPEED = 2.0  # m/s: a speed beyond this leaves no doubt of its direction
 DIRECTION_ALIKE = 100.0  # readings: so many share their direction, so they tell no more of it than one
@@ -30,6 +31,7 @@ def parameters(wheel: Wheel) -> Array:
     row[LEVER_ARM_B] = wheel.position_m
     row[STEERED] = float(wheel.steered)
     row[UNSIGNED] = float(wheel.unsigned and wheel.direction_signal is None)
+    row[SCALE_STATE] = SCALE.start
     return row
 
 
@@ -45,8 +47,9 @@ def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     return reading.speed, variance, alike
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
-    """Innovation (1,) [m/s]: reading less (1 + scale) times the contact point's speed."""
+def observe(state: FilterState, row: Array, parameter: Array, certain: bool = False) -> Observation:
+    """Innovation (1,) [m/s]: reading less (1 + scale) times the contact point's speed. With `certain` the state is taken at
+    its word: an unsigned wheel turns the way that it says."""
     velocity_v, by_error = point_velocity_v(state, parameter[LEVER_ARM_B])
     forward, sideways = float(velocity_v[0]), float(velocity_v[1])
     along = np.array([1.0, 0.0, 0.0])
@@ -55,12 +58,13 @@ def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
     if parameter[STEERED] and track > LEAST_TRACK_SPEED:
         speed = math.copysign(track, forward)
         along = np.array([forward / speed, sideways / speed, 0.0])
-    scale = 1 + state.nominal[WHEEL_SCALE.start]
+    which = int(parameter[SCALE_STATE])
+    scale = 1 + state.nominal[which + 1]
     jacobian = scale * (along @ by_error)
-    jacobian[SCALE] = speed
+    jacobian[which] = speed
     reading, variance = row[SPEED], row[VARIANCE]
     if parameter[UNSIGNED] and reading > 0:
-        if abs(speed) > SURE_SPEED:
+        if certain or abs(speed) > SURE_SPEED:
             reading = math.copysign(reading, speed)
         else:
             spread = float(jacobian @ state.covariance @ jacobian) + variance

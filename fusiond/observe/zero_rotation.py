@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from fusiond.config import Motion
 from fusiond.earth import Array
 from fusiond.elementary import square
 from fusiond.observe.model import PARAMETERS, Observation, mat_eb
 from fusiond.rotation import skew
+from fusiond.sections import Motion
 from fusiond.state import ATTITUDE, GYRO_BIAS, GYRO_BIAS_B, RATE_B, FilterState
 from fusiond.strapdown import EARTH_RATE_E
 

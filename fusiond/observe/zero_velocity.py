@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.config import Motion
 from fusiond.earth import Array
 from fusiond.elementary import square
 from fusiond.observe.model import PARAMETERS, Observation
+from fusiond.sections import Motion
 from fusiond.state import VELOCITY, VELOCITY_E, FilterState
 
 VARIANCE = 0  # (m/s)^2, parameters

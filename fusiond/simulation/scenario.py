@@ -13,7 +13,7 @@ from typing import Annotated, Literal, get_args
 
 from msgspec import Meta, field
 
-from fusiond.config import NotNegative, Positive, Vector
+from fusiond.sections import NotNegative, Positive, Vector
 from fusiond.toml_file import Name, Section, decode, read_text, refuse
 
 Degrees = Annotated[float, Meta(ge=-360, le=360)]

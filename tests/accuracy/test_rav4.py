@@ -9,8 +9,8 @@ import pytest
 
 from fusiond import config as configuration
 from fusiond.comparison import TruthReport, Window
-from fusiond.config import Config
 from fusiond.replay import Options, parse_withheld, replay
+from fusiond.sections import Config
 
 ROOT = Path(__file__).parents[2]
 DRIVE = ROOT.parent / "shared" / "data" / "comma2k19-rav4"

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fusiond.config import Config
 from fusiond.fusion import Fusion
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Payload, WheelSpeed
+from fusiond.sections import Config
 from fusiond.state import PHASE, RUNNING
 from tests.conftest import needs_compiled
 from tests.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.config import Config
 from fusiond.earth import ecef, mat_ne
 from fusiond.kernel import ROW, compiled_available, make_kernel, run_one
 from fusiond.plan import IMU, MODEL, plan
+from fusiond.sections import Config
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import parse
 from fusiond.simulation.truth import Truth

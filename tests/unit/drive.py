@@ -8,9 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fusiond import config
-from fusiond.config import Config
 from fusiond.messages import Message
 from fusiond.replay import Replay, Wants
+from fusiond.sections import Config
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive

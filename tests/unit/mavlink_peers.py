@@ -21,10 +21,10 @@ import numpy as np
 from live import DEADLINE, configuration
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fusiond.config import Config
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.messages import OutcomeCounts, StateMessage, state_message
 from fusiond.rotation import matrix_from_euler, quaternion
+from fusiond.sections import Config
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.inputs import Inbox
 from fusiond_adapters.mavlink_link import MavlinkLink

@@ -16,6 +16,7 @@ from fusiond.rotation import euler, matrix, matrix_from_euler
 from fusiond.state import (
     ALIGNING,
     BLOWN,
+    CHOOSING,
     GYRO_BIAS,
     GYRO_BIAS_B,
     PHASE,
@@ -85,7 +86,7 @@ def test_at_rest_with_a_given_heading(compiled: bool) -> None:
 
 def test_at_rest_without_a_heading_it_waits(compiled: bool) -> None:
     fusion = fuse(config(), measurements(straight(4.0, 0.0)), compiled)
-    assert fusion.history.head.stamps[PHASE] == ALIGNING
+    assert fusion.history.head.stamps[PHASE] == CHOOSING
     estimate = fusion.estimate_at(T0 + 4 * SECOND)
     assert (estimate.mode, estimate.state) == (Mode.ALIGNING, None)
     assert fusion.totals()["FUSED"] == sum(fusion.totals().values())
@@ -106,7 +107,8 @@ def test_in_motion_by_the_course(compiled: bool) -> None:
 
 def test_slow_motion_has_no_course(compiled: bool) -> None:
     fusion = fuse(config(filter={"course_speed_mps": 5.0}), measurements(straight(3.0, 4.5)), compiled)
-    assert fusion.history.head.stamps[PHASE] == ALIGNING
+    assert fusion.history.head.stamps[PHASE] == CHOOSING
+    assert fusion.estimate_at(T0 + 3 * SECOND).state is None
 
 
 @pytest.mark.parametrize("heading", [{}, GIVEN], ids=["by course", "given"])

@@ -16,10 +16,10 @@ import pytest
 import zenoh
 
 from fusiond.__main__ import INTERRUPTED, SUCCESS, UNUSABLE, USAGE, main
-from fusiond.config import Zenoh
 from fusiond.demo import explanation
 from fusiond.messages import CSV_COLUMNS, StateMessage, csv_header, csv_row, decode
 from fusiond.report import Summary
+from fusiond.sections import Zenoh
 from fusiond_adapters.zenoh import open_session, state_key
 
 DRIVE = """

@@ -16,7 +16,6 @@ from test_zenoh import messages as states
 from test_zenoh import python, read_line
 
 from fusiond.client import Client, ClientError
-from fusiond.config import Config, Encoding, Publish, Vehicle, Zenoh
 from fusiond.estimate import Mode
 from fusiond.messages import (
     ConfigMessage,
@@ -29,6 +28,7 @@ from fusiond.messages import (
     OutcomeCounts,
     StateMessage,
 )
+from fusiond.sections import Config, Encoding, Publish, Vehicle, Zenoh
 from fusiond_adapters.outputs import OutputLost
 from fusiond_adapters.zenoh_output import ZenohOutput
 

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusiond.clock import FUTURE_TOLERANCE, Clock
-from fusiond.config import Can, Config, Gnss, Imu, Wheel
 from fusiond.measurements import (
     ClockPair,
     GnssPosition,
@@ -27,6 +26,7 @@ from fusiond.measurements import (
     WheelSpeed,
     boot_clock,
 )
+from fusiond.sections import Can, Config, Gnss, Imu, Wheel
 
 MS = 1_000_000
 SECOND = 1_000 * MS

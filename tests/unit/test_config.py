@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fusiond import config
-from fusiond.config import Config
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 
 CAR = Path("/etc/fusiond/car.toml")

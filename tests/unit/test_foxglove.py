@@ -18,9 +18,9 @@ import msgspec
 import pytest
 from drive import messages, settings
 
-from fusiond.config import Foxglove, Mcap, Prometheus
 from fusiond.describe import description
 from fusiond.messages import EventMessage, HealthMessage, State, StateMessage, encode
+from fusiond.sections import Foxglove, Mcap, Prometheus
 from fusiond.toml_file import ConfigError
 from fusiond_adapters import foxglove_layout
 from fusiond_adapters.foxglove import FOXGLOVE, LOG, POSE, TOPICS, Converter, channels, innovations_topic

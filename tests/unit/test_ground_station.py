@@ -28,7 +28,6 @@ from mavlink_peers import (
 )
 from pymavlink.dialects.v20 import common
 
-from fusiond.config import Config
 from fusiond.earth import ecef, mat_ne
 from fusiond.estimate import Mode
 from fusiond.messages import (
@@ -41,6 +40,7 @@ from fusiond.messages import (
     State,
 )
 from fusiond.rotation import matrix
+from fusiond.sections import Config
 from fusiond_adapters.ground_station import GroundStation, ratios
 from fusiond_adapters.inputs import Inbox
 from fusiond_adapters.mavlink_answers import Parameter

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.config import Config
 from fusiond.fusion import Fusion
 from fusiond.kernel import Outcome
 from fusiond.measurements import GnssPosition, ImuSample, Invalid, Measurement, Payload, WheelSpeed
+from fusiond.sections import Config
 from fusiond.state import NEVER, T_IMU, T
 from tests.conftest import needs_compiled
 from tests.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town

@@ -15,15 +15,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.config import Config
 from fusiond.earth import geodetic
 from fusiond.fusion import Fusion
 from fusiond.kernel import Kernel, Outcome, compiled_available, make_kernel
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.observe.model import mat_eb
 from fusiond.plan import plan
+from fusiond.sections import Config
 from fusiond.state import (
     CONSTRAINT_FUSED,
+    ERROR_SIZE,
     MEAN_FORCE_B,
     MEAN_RATE_B,
     MEAN_WEIGHT,
@@ -36,11 +37,13 @@ from fusiond.state import (
     RUNNING,
     SCATTER_FORCE,
     SCATTER_RATE,
+    T_ALIKE,
     T_IMU,
     T_LAST,
     T_REJECTED,
     T_STILL,
     VELOCITY_E,
+    WIDE_SIZE,
     FilterState,
 )
 from tests.conftest import needs_compiled
@@ -48,8 +51,9 @@ from tests.streams import MS, SECOND, T0, apply, bits, config, fuse, measurement
 
 pytestmark = needs_compiled
 CLOSE = 1e-12
-# natural scales of the nominal state: m (rounding of 6,400 km is 1e-9 m), m/s, 1, rad/s, m/s^2, 1, rad
-SCALES = np.repeat([2e3, 20.0, 1.0, 0.1, 1.0, 1.0], [3, 3, 4, 3, 3, 3])
+# natural scales of the nominal state: m (rounding of 6,400 km is 1e-9 m), m/s, 1, rad/s, m/s^2, 1 and rad, m, s, m
+SCALES = np.repeat([2e3, 20.0, 1.0, 0.1, 1.0, 1.0, 10.0, 0.1, 100.0], [3, 3, 4, 3, 3, 6, 3, 2, 1])
+LEARNT = {"lever_arm_sigma_m": 0.3, "delay_sigma_ms": 100.0, "velocity_delay_sigma_ms": 50.0}
 ROOT = Path(__file__).parents[2]
 
 
@@ -82,10 +86,11 @@ def both(settings: Config, state: FilterState, events: list[Measurement]) -> tup
     return fusions
 
 
+@pytest.mark.parametrize("wide", [False, True], ids=["", "wide"])
 @pytest.mark.parametrize("seed", range(20))
-def test_propagate(seed: int) -> None:
-    rng, layout = np.random.default_rng(seed), plan(config())
-    state = running_state(rng)
+def test_propagate(seed: int, wide: bool) -> None:
+    rng, layout = np.random.default_rng(seed), plan(config(gnss=LEARNT if wide else {}))
+    state = running_state(rng, size=layout.size)
     twin, dt = state.copy(), float(rng.uniform(1e-6, 0.12))
     force, rate = rng.normal(0.0, 5.0, 3) - [0, 0, 9.8], rng.normal(0.0, 0.5, 3)
     make_kernel(layout, True).propagate(state, dt, force, rate)
@@ -157,9 +162,10 @@ KINDS = {
 }
 
 
+@pytest.mark.parametrize("wide", [False, True], ids=["", "wide"])
 @pytest.mark.parametrize("correlation_s", [0.0, 0.7])
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_measurement(kind: str, correlation_s: float) -> None:
+def test_every_measurement(kind: str, correlation_s: float, wide: bool) -> None:
     """Several of one kind, between two IMU samples: interpolated, judged and fused alike."""
     wheel = {"position_m": (1.3, -0.8, 0.4), "steered": "steered" in kind, "unsigned": kind != "wheel"}
     settings = config(
@@ -167,14 +173,15 @@ def test_every_measurement(kind: str, correlation_s: float) -> None:
             "lever_arm_m": (0.4, -0.2, -1.1),
             "position_correlation_s": correlation_s,
             "velocity_correlation_s": correlation_s,
-        },
+        }
+        | (LEARNT if wide else {}),
         wheel=wheel | {"correlation_s": correlation_s},
-        filter={"gate_probability": 0.9},
+        filter={"gate_probability": 0.9, "wheel_scale_by": "wheel" if wide else "vehicle"},
     )
     seen: set[int] = set()
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        state = running_state(rng)
+        state = running_state(rng, size=WIDE_SIZE if wide else ERROR_SIZE)
         state.stamps[T_IMU] = T0
         if kind == "wheel slow":
             state.nominal[VELOCITY_E] = rng.normal(0.0, 0.4, 3)
@@ -239,8 +246,11 @@ def test_reset_after_a_long_rejection(kind: str) -> None:
         "velocity": GnssVelocity(90.0, -90.0, 9.0),
         "velocity 2-D": GnssVelocity(90.0, -90.0),
     }[kind]
+    first, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
+    state.memory[source] = first.history.head.memory[source]  # its innovation; it will be off by as much again
+    state.source_stamps[source, [T_LAST, T_REJECTED]] = T0 - 100 * MS
     for since, resets in ((5 * SECOND, 1), (5 * SECOND - 1, 0), (None, 0)):
-        state.source_stamps[source, T_REJECTED] = NEVER if since is None else T0 - since
+        state.source_stamps[source, T_ALIKE] = NEVER if since is None else T0 - since
         fusion, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
         assert fusion.history.head.stamps[RESETS] == resets
         assert fusion.history.rows[0]["outcome"] == (Outcome.FUSED if resets else Outcome.REJECTED)
@@ -303,7 +313,7 @@ def test_layout_and_size() -> None:
 
     _kernel.check_layout()
     with pytest.raises(ValueError, match="18 error states"):
-        _kernel.Kernel(plan(config()), 17)
+        _kernel.Kernel(plan(config(gnss=LEARNT)))
     with pytest.raises(ValueError, match="numbers"):
         make_kernel(plan(config()), True).predict(FilterState(2), T0)
     assert compiled_available()

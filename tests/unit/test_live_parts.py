@@ -14,8 +14,8 @@ import pytest
 from live import SYSTEM, Autopilot, configuration, parsed
 from pymavlink.dialects.v20 import common
 
-from fusiond.config import Config
 from fusiond.reload import changes
+from fusiond.sections import Config
 from fusiond_adapters.can_bus import CanBus, CanFrame
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.inputs import Inbox

@@ -10,7 +10,8 @@ import pytest
 from live import SYSTEM, Autopilot, configuration, parsed
 from pymavlink.dialects.v20 import common
 
-from fusiond.config import Config, load
+from fusiond.config import load
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.mavlink_signing import EPOCH_NS, MINUTE, TICK_NS, Signing
 from fusiond_adapters.mavlink_talk import SECOND, MavlinkTalk

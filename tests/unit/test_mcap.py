@@ -21,9 +21,9 @@ from test_daemon import aligned, free_port, udp
 from test_daemon import drive as steer
 
 from fusiond.__main__ import SUCCESS, UNUSABLE, USAGE, main
-from fusiond.config import Config, Mcap
 from fusiond.estimate import Mode
 from fusiond.messages import EventMessage, HealthMessage, InnovationMessage, Message, StateMessage, csv_row, decode
+from fusiond.sections import Config, Mcap
 
 pytest.importorskip("mcap", reason="the extra mcap is not installed")
 

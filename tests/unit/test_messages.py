@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusiond.config import Encoding
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.messages import (
     CSV_COLUMNS,
@@ -30,6 +29,7 @@ from fusiond.messages import (
     schemas,
     state_message,
 )
+from fusiond.sections import Encoding
 
 DOCS = Path(__file__).parents[2] / "docs"
 T_NS = 1_700_000_000_123_456_789

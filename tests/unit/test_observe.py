@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.config import Gnss, Motion, Wheel
 from fusiond.earth import Array, ecef, mat_ne
 from fusiond.measurements import GnssPosition, GnssVelocity, WheelSpeed
 from fusiond.observe import (
@@ -26,6 +25,7 @@ from fusiond.observe import (
 from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, VALUES, mat_eb, mat_vb, rate_b
 from fusiond.observe.wheel_speed import direction
 from fusiond.rotation import matrix_from_euler, quaternion
+from fusiond.sections import Gnss, Motion, Wheel
 from fusiond.state import (
     GYRO_BIAS_B,
     MOUNT,
@@ -34,6 +34,7 @@ from fusiond.state import (
     RATE_B,
     VELOCITY_E,
     WHEEL_SCALE,
+    WIDE_SIZE,
     FilterState,
 )
 from fusiond.update import inject
@@ -42,7 +43,8 @@ from tests.streams import EARTH_RATE_E, MUNICH, running_state
 GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
-STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4], 3)
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])
+LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
 
 
 class Case(NamedTuple):
@@ -66,6 +68,13 @@ CASES = {
     "velocity 2-D": Case(
         "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0), GNSS), gnss_velocity.parameters(GNSS), 10.0
     ),
+    "position, learning": Case("gnss_position", gnss_position.values(FIX, LEARNT), gnss_position.parameters(LEARNT), 10.0),
+    "velocity, learning": Case(
+        "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0, 1.0), LEARNT), gnss_velocity.parameters(LEARNT), 10.0
+    ),
+    "velocity 2-D, learning": Case(
+        "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0), LEARNT), gnss_velocity.parameters(LEARNT), 10.0
+    ),
     "wheel signed": wheel_case(10.0, 10.0, unsigned=False),
     "wheel signed in reverse": wheel_case(-3.0, -3.1, unsigned=False),
     "wheel signed at rest": wheel_case(0.0, 0.0, unsigned=False),
@@ -84,7 +93,7 @@ CASES = {
 
 def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     """A state that moves forward along its own axis, with a little of everything else."""
-    state = running_state(rng)
+    state = running_state(rng, size=WIDE_SIZE)
     slip = 0.1 if abs(speed) > 1 else 0.01
     state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
     state.auxiliary[RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)

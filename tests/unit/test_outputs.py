@@ -20,7 +20,6 @@ from test_daemon import aligned, drive, free_port, fused
 
 from fusiond import config
 from fusiond.client import Client
-from fusiond.config import Zenoh
 from fusiond.engine import SECOND, Engine
 from fusiond.innovations import NAMES
 from fusiond.kernel import Outcome
@@ -39,6 +38,7 @@ from fusiond.messages import (
 )
 from fusiond.publication import Publication
 from fusiond.replay import Replay, Wants
+from fusiond.sections import Zenoh
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.outputs import Outbox, OutputLost
 from fusiond_adapters.zenoh import open_session

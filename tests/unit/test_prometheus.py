@@ -12,7 +12,6 @@ import pytest
 from drive import messages, settings
 from test_foxglove import DEADLINE, serving
 
-from fusiond.config import Prometheus
 from fusiond.messages import (
     HealthMessage,
     InnovationMessage,
@@ -22,6 +21,7 @@ from fusiond.messages import (
     Quantiles,
     StateMessage,
 )
+from fusiond.sections import Prometheus
 
 pytest.importorskip("prometheus_client", reason="the extra prometheus is not installed")
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose
 from test_frames import state
 
-from fusiond.config import Config, Ros2, parse
+from fusiond.config import parse
 from fusiond.estimate import Mode
 from fusiond.frames import LocalFrame, LocalState, Placed
 from fusiond.messages import (
@@ -24,6 +24,7 @@ from fusiond.messages import (
     SourceHealth,
     StateMessage,
 )
+from fusiond.sections import Config, Ros2
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.outputs_table import ros2 as factory
 

@@ -15,11 +15,11 @@ import zenoh
 from numpy.testing import assert_allclose
 from test_ros2 import DEADLINE, SECOND, T0, definitions, health, told
 
-from fusiond.config import Config, Ros2, Zenoh
 from fusiond.estimate import Mode
 from fusiond.frames import LocalFrame, LocalState
 from fusiond.messages import Message, State, StateMessage
 from fusiond.rotation import matrix
+from fusiond.sections import Config, Ros2, Zenoh
 from fusiond_adapters import ros2_wire as wire
 from fusiond_adapters.outputs import OutputLost
 from fusiond_adapters.ros2 import Ros2Output, topics

@@ -18,7 +18,6 @@ from fusiond.state import (
     ATTITUDE,
     GYRO_BIAS,
     MOUNT_ERROR,
-    NOMINAL_SIZE,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
@@ -178,7 +177,7 @@ def difference(a: FilterState, b: FilterState) -> Array:
     error = np.zeros(a.size)
     x, y = a.nominal, b.nominal
     error[:6] = x[:6] - y[:6]
-    error[9:] = x[10:NOMINAL_SIZE] - y[10:NOMINAL_SIZE]
+    error[9:] = x[10 : a.size + 1] - y[10 : a.size + 1]
     conjugate = y[QUATERNION_EB] * [1, -1, -1, -1]
     cosine, *axis = quaternion_multiply(x[QUATERNION_EB], conjugate).tolist()
     sine = math.hypot(*axis)

@@ -19,9 +19,9 @@ from drive import messages, settings
 from test_zenoh import DEADLINE, free_port
 
 from fusiond.__main__ import UNUSABLE, main
-from fusiond.config import Zenoh
 from fusiond.estimate import Mode
 from fusiond.messages import EventMessage, HealthMessage, Message, OutputHealth, StateMessage
+from fusiond.sections import Zenoh
 from fusiond.top import Line, View, plain, screen
 from fusiond_adapters.top import ansi
 from fusiond_adapters.zenoh import ZenohPublisher, open_session

@@ -13,7 +13,7 @@ from fusiond.observe.model import Observation
 from fusiond.plan import plan
 from fusiond.state import NEVER, POSITION, POSITION_E, SCALE, WHEEL_SCALE, FilterState
 from fusiond.strapdown import coast
-from fusiond.update import chi_square, correlation_factor, solve_spd, update
+from fusiond.update import chi_square, cholesky, correlation_factor, solve, update
 from tests.streams import T0, apply, config, running_state
 
 ALWAYS = math.inf  # a gate that lets everything pass
@@ -211,12 +211,13 @@ def test_correlation_factor() -> None:
     assert correlation_factor(0.0, 1e12) == math.inf
 
 
-def test_solve_spd() -> None:
+def test_cholesky_and_solve() -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(3, 3))
     matrix, right = root @ root.T + np.eye(3), rng.normal(size=(3, 5))
-    solution = solve_spd(matrix, right)
-    assert solution is not None
-    np.testing.assert_allclose(matrix @ solution, right, atol=1e-12)
+    lower = cholesky(matrix)
+    assert lower is not None
+    np.testing.assert_allclose(lower @ lower.T, matrix, atol=1e-12)
+    np.testing.assert_allclose(matrix @ solve(lower, right), right, atol=1e-12)
     for bad in (-np.eye(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.diag([1.0, math.nan]), np.diag([math.inf, 1.0])):
-        assert solve_spd(bad, np.ones((2, 1))) is None
+        assert cholesky(bad) is None

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from fusiond.config import Encoding, Zenoh
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.messages import OutcomeCounts, StateMessage, csv_row, encode, state_message
+from fusiond.sections import Encoding, Zenoh
 from fusiond_adapters.zenoh import (
     CONTENT_TYPES,
     PublishError,

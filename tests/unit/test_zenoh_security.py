@@ -14,8 +14,8 @@ import pytest
 import zenoh
 
 from fusiond.client import Client, ClientError
-from fusiond.config import Config, Vehicle, Zenoh
 from fusiond.messages import EventMessage
+from fusiond.sections import Config, Vehicle, Zenoh
 from fusiond_adapters.zenoh import ZenohPublisher, open_session, session_config
 from fusiond_adapters.zenoh_answers import Answers
 
