@@ -74,7 +74,8 @@ cdef enum:
     REST_RATE_B = 21
     FIRST_VELOCITY_N = 24
     CONSTRAINT_RATIO = 32
-    AUXILIARY_SIZE = 35
+    RATE_VARIANCE = 35
+    AUXILIARY_SIZE = 36
     LAST_VALUE = 0
     LAST_RATIO = 1
     NOISE_EXCESS = 2
@@ -143,6 +144,8 @@ cdef double GRAVITY_RATIO = _GRAVITY_RATIO
 cdef double COAST_ACCEL2 = strapdown.COAST_ACCEL * strapdown.COAST_ACCEL
 cdef double COAST_RATE2 = strapdown.COAST_RATE * strapdown.COAST_RATE
 cdef double LONGEST_STEP = strapdown.LONGEST_STEP
+cdef double OWN_SCATTER = motion.OWN_SCATTER
+cdef double LEAST_SPAN = kernel.LEAST_SPAN
 cdef double MEAN_TIME = motion.MEAN_TIME
 cdef double MEAN_FILLED = motion.MEAN_FILLED
 cdef int64_t WHEEL_FRESH_NS = motion.WHEEL_FRESH_NS
@@ -175,6 +178,7 @@ cdef double SAME_IF_NOMINAL = health.SAME_IF_NOMINAL
 cdef double SAME_IF_FAULTY = health.SAME_IF_FAULTY
 cdef double OTHER_IF_FROZEN = health.OTHER_IF_FROZEN
 cdef double TELLING = health.TELLING
+cdef double CHANCE = health.CHANCE
 cdef double NOTED = health.NOTED
 cdef double DISTRUST = health.DISTRUST
 cdef double NOISE_TIME = health.NOISE_TIME
@@ -199,7 +203,7 @@ def check_layout():
         assert getattr(layout, name).start == offset, name
     for name, number in (
         ("NOMINAL_SIZE", NOMINAL_SIZE), ("CALIBRATIONS", CALIBRATIONS), ("WIDE_SIZE", WIDE_SIZE), ("SCATTER_FORCE", SCATTER_FORCE), ("SCATTER_RATE", SCATTER_RATE),
-        ("MEAN_WEIGHT", MEAN_WEIGHT), ("AUXILIARY_SIZE", AUXILIARY_SIZE), ("LAST_VALUE", LAST_VALUE),
+        ("MEAN_WEIGHT", MEAN_WEIGHT), ("RATE_VARIANCE", RATE_VARIANCE), ("AUXILIARY_SIZE", AUXILIARY_SIZE), ("LAST_VALUE", LAST_VALUE),
         ("LAST_RATIO", LAST_RATIO), ("NOISE_EXCESS", NOISE_EXCESS), ("NOMINAL", NOMINAL), ("NOISY", NOISY),
         ("BIASED", BIASED), ("FROZEN", FROZEN), ("BIAS_VARIANCE", BIAS_VARIANCE), ("LAST_SUM", LAST_SUM),
         ("INTERVAL", INTERVAL), ("MEAN_NIS", MEAN_NIS), ("T_JUDGED", T_JUDGED), ("T_ALIKE", T_ALIKE), ("T_BACK", T_BACK), ("MEMORY_SIZE", MEMORY_SIZE), ("T", T), ("T_IMU", T_IMU),
@@ -766,6 +770,12 @@ cdef void point_velocity(double* x, double* auxiliary, double* point, int first,
     skew_rows(turned + 3 * first, x + VELOCITY_E, 1.0, jacobian + first * n, last - first, ATTITUDE)
     skew_rows(r + 3 * first, point, 1.0, jacobian + first * n, last - first, GYRO_BIAS)
     cdef double by[6]
+    for i in range(3):  # with the mean rate, see fusiond.observe.model
+        rate[i] = auxiliary[MEAN_RATE_B + i] - x[GYRO_BIAS_B + i]
+    cross(rate, point, swing)
+    transposed_times(c, x + VELOCITY_E, vb)
+    for i in range(3):
+        vb[i] = vb[i] + swing[i]
     by[0] = -cy * sp * vb[0] + cy * cp * vb[2]
     by[1] = -sy * cp * vb[0] - cy * vb[1] - sy * sp * vb[2]
     by[2] = -sy * sp * vb[0] + sy * cp * vb[2]
@@ -775,6 +785,14 @@ cdef void point_velocity(double* x, double* auxiliary, double* point, int first,
     for i in range(first, last):
         for k in range(2):
             jacobian[i * n + MOUNT_ERROR + k] = by[2 * i + k]
+
+
+cdef void with_rate_noise(double* auxiliary, Observation* seen) noexcept nogil:
+    cdef double* by
+    cdef int a
+    for a in range(seen.m):
+        by = seen.jacobian + a * n + GYRO_BIAS
+        seen.variance[a] += auxiliary[RATE_VARIANCE] * (by[0] * by[0] + by[1] * by[1] + by[2] * by[2])
 
 
 cdef void wheel(double* x, double* p, double* auxiliary, double* row, double* parameter, Observation* seen,
@@ -1131,7 +1149,7 @@ cdef class Kernel:
     cdef double gates[4]
     cdef Noise noise
     cdef int64_t imu_gap, restart_gap, gnss_reset, gnss_return, constraint_interval, still_after, snapshot_interval
-    cdef bint standstill, non_holonomic
+    cdef bint standstill, non_holonomic, wheeled
     cdef double course_speed, still_wheel, still_gyro2, still_accel2, zero_velocity_factor
     cdef double[::1] head_numbers
     cdef int64_t[::1] head_whole
@@ -1157,6 +1175,7 @@ cdef class Kernel:
             raise ValueError(f"compiled for {n} error states, not {plan.size}")
         self.sources = len(plan.sources)
         self.imu_source = plan.imu_source
+        self.wheeled = len(plan.wheels) > 0
         self.models = np.array(plan.models, dtype=np.int32)
         self.parameters = np.ascontiguousarray(plan.parameters)
         self.constraints = np.ascontiguousarray(plan.constraints)
@@ -1405,6 +1424,7 @@ cdef class Kernel:
         if self.models[row.source] == WHEEL_SPEED:
             self.memory[row.source * MEMORY_SIZE + LAST_VALUE] = row.values[0]
             return
+        arrive(self.memory + row.source * MEMORY_SIZE, self.source_stamps + row.source * SOURCE_STAMPS_SIZE, row)
         if self.stamps[T_IMU] != NEVER:
             self.watch(row, (row.t_ns - self.stamps[T_IMU]) * 1e-9)
         self.keep_sample(row)
@@ -1476,6 +1496,7 @@ cdef class Kernel:
             change = imu.values[3 + i] - a[HELD_RATE_B + i]
             rate[i] = a[HELD_RATE_B + i] + middle * change
             a[RATE_B + i] = a[HELD_RATE_B + i] + end * change
+        a[RATE_VARIANCE] = self.noise.gyro / (span * 1e-9) * ((1 - end) * (1 - end) + end * end)
         propagate(self.x, self.p, dt, force, rate, &self.noise)
 
     cdef void hold(self, Row* row) noexcept nogil:
@@ -1489,6 +1510,9 @@ cdef class Kernel:
         if stamps[T_JUDGED] == NEVER or row.t_ns - stamps[T_JUDGED] >= JUDGE_NS:
             judge(memory, stamps, NULL, 0, same, row.t_ns)
         self.keep_sample(row)
+        self.auxiliary[RATE_VARIANCE] = 0.0
+        if dt > 0:
+            self.auxiliary[RATE_VARIANCE] = self.noise.gyro / (dt if dt > LEAST_SPAN else LEAST_SPAN)
         self.watch(row, dt)
 
     cdef void watch(self, Row* row, double dt) noexcept nogil:
@@ -1514,9 +1538,16 @@ cdef class Kernel:
 
     cdef bint stands(self) noexcept nogil:
         cdef int i, wheels = 0, fresh = 0
+        cdef double interval, own, limit
         if not self.standstill or self.auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
             return False
-        if self.auxiliary[SCATTER_FORCE] > self.still_accel2 or self.auxiliary[SCATTER_RATE] > self.still_gyro2:
+        interval = self.memory[self.imu_source * MEMORY_SIZE + INTERVAL] if self.wheeled else 0.0
+        own = OWN_SCATTER / interval if interval > 0 else 0.0
+        limit = own * self.noise.accel
+        if self.auxiliary[SCATTER_FORCE] > (self.still_accel2 if self.still_accel2 > limit else limit):
+            return False
+        limit = own * self.noise.gyro
+        if self.auxiliary[SCATTER_RATE] > (self.still_gyro2 if self.still_gyro2 > limit else limit):
             return False
         for i in range(self.sources):
             if self.models[i] == WHEEL_SPEED:
@@ -1664,16 +1695,19 @@ cdef class Kernel:
         if model == WHEEL_SPEED:
             wheel(self.x, self.p, self.auxiliary, row.values, parameter, &seen, True)
             seen.variance[0] = seen.variance[0] * parameter[SHARED]
+            with_rate_noise(self.auxiliary, &seen)
             self.weigh(i, &seen, factor)
         self.observe(model, row, parameter, &seen)
         for a in range(seen.m):
             seen.variance[a] = seen.variance[a] * parameter[SHARED]
+        with_rate_noise(self.auxiliary, &seen)
         if model != WHEEL_SPEED:
             self.weigh(i, &seen, factor)
         self.renew(&seen, factor)
 
     cdef void take(self, int i, Observation* seen, double factor) noexcept nogil:
         """fusiond.bank.take, of the hypothesis that is looked at."""
+        with_rate_noise(self.auxiliary, seen)
         self.weigh(i, seen, factor)
         self.renew(seen, factor)
 
@@ -1806,6 +1840,7 @@ cdef class Kernel:
         cdef double across[3][n]
         cdef double s[3][3]
         cdef Update done
+        with_rate_noise(self.auxiliary, seen)
         project(self.p, seen, across, s)
         done = update(self.x, self.p, seen, self.gates[seen.m], factor, True, 0.0, across, s)
         self.auxiliary[CONSTRAINT_RATIO + which] = done.ratio
@@ -1859,13 +1894,20 @@ cdef class Kernel:
         self.remember(model, memory, row)
         self.observe(model, row, parameter, &seen)
         project(self.p, &seen, across, s)
-        share = 1 + memory[NOISE_EXCESS]
+        share = 1.0
+        if memory[NOISE_EXCESS] > CHANCE:
+            share = 1 + (memory[NOISE_EXCESS] - CHANCE)
+        elif memory[NOISE_EXCESS] < -CHANCE:
+            share = 1 + (memory[NOISE_EXCESS] + CHANCE)
         if share < parameter[NOISE_LEAST]:
             share = parameter[NOISE_LEAST]
         if share > parameter[NOISE_MOST]:
             share = parameter[NOISE_MOST]
         for a in range(seen.m):
-            given[a] = seen.variance[a] * parameter[SHARED]
+            seen.variance[a] *= parameter[SHARED]
+        with_rate_noise(self.auxiliary, &seen)
+        for a in range(seen.m):
+            given[a] = seen.variance[a]
             learnt[a] = given[a] * share
             row.innovation[a] = seen.innovation[a]
             row.variance[a] = s[a][a] + learnt[a]
@@ -1890,14 +1932,13 @@ cdef class Kernel:
         done = update(self.x, self.p, &seen, self.gates[seen.m], factor, trusted, parameter[CLUTTER], across, s)
         row.ratio = done.ratio
         memory[LAST_RATIO] = done.ratio
-        if done.fused:
-            stamps[T_REJECTED] = NEVER
-            stamps[T_ALIKE] = NEVER
-        elif model != WHEEL_SPEED and self.locked_out(row, memory, stamps, companion, &seen):
+        if not done.fused and model != WHEEL_SPEED and self.locked_out(row, memory, stamps, companion, &seen):
             self.reset_block(&seen, POSITION if model == GNSS_POSITION else VELOCITY)
             begin_health(memory)
             done.fused = True
         if done.fused:
+            stamps[T_REJECTED] = NEVER
+            stamps[T_ALIKE] = NEVER
             stamps[T_FUSED] = row.t_ns
             if model == GNSS_POSITION:
                 self.stamps[T_POSITION] = row.t_ns

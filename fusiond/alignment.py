@@ -13,6 +13,7 @@ import numpy as np
 
 from fusiond.earth import Array, geodetic_trig, mat_ne_from_trig
 from fusiond.elementary import atan2, sin_cos, square
+from fusiond.health import arrive
 from fusiond.motion import MEAN_FILLED, ZERO_VELOCITY, watch
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed, zero_velocity
 from fusiond.observe.model import LEVER_ARM_B
@@ -83,6 +84,7 @@ def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan
     stamps[T] = t_ns
     if model == IMU:
         force_b, rate_b = values[0:3], values[3:6]
+        arrive(state.memory[source], state.source_stamps[source], values, t_ns)
         if stamps[T_IMU] != NEVER:
             watch(state, force_b, rate_b, (t_ns - stamps[T_IMU]) * 1e-9, plan)
         stamps[T_IMU] = t_ns

@@ -18,7 +18,7 @@ from fusiond.elementary import exp
 from fusiond.health import OUTLIER_VARIANCE, OUTLIERS
 from fusiond.motion import ZERO_ROTATION, ZERO_VELOCITY, constraints_due
 from fusiond.observe import CONSTRAINTS, non_holonomic
-from fusiond.observe.model import LEVER_ARM_B, Observation, point_velocity_v
+from fusiond.observe.model import LEVER_ARM_B, Observation, point_velocity_v, with_rate_noise
 from fusiond.plan import Plan
 from fusiond.rotation import quaternion_multiply
 from fusiond.state import (
@@ -87,7 +87,7 @@ def constrain(state: FilterState, plan: Plan) -> None:
                 parameters = plan.constraints[which]
                 seen = CONSTRAINTS[which].observe(hypothesis, parameters, parameters)
                 assert seen is not None, "a vehicle at rest is always observed"
-                take(state, i, hypothesis, seen, plan.gates[len(seen.innovation)], factor)
+                take(state, i, hypothesis, with_rate_noise(hypothesis, seen), plan.gates[len(seen.innovation)], factor)
     if rolling and not still:
         _roll(state, plan)
     normalise(state)
@@ -105,7 +105,7 @@ def _roll(state: FilterState, plan: Plan) -> None:
     if fastest < parameters[non_holonomic.LEAST_SPEED]:
         return
     for i, observation in zip(kept, seen, strict=True):
-        take(state, i, state.hypothesis(i), observation, plan.gates[2], 1.0)
+        take(state, i, state.hypothesis(i), with_rate_noise(state, observation), plan.gates[2], 1.0)
 
 
 def normalise(state: FilterState) -> None:

@@ -57,6 +57,7 @@ ABSENT = 1e-3  # chance that a source that was heard a moment ago has gone
 DETECTION = 0.9  # chance that an expected reading comes
 MOST_MISSES = 30
 UNKNOWN_INTERVAL = 1.0  # s, where a source was never heard
+CHANCE = 0.2  # learnt noise that differs by less than this share from the given is the same
 NOISE_TIME = 30.0  # s, over which noise is learnt
 CLIPPED = 25.0  # a squared innovation counts for at most so many times its variance: outliers are not noise
 INTERVAL_SHARE = 0.05  # weight of the newest interval in the mean
@@ -195,8 +196,10 @@ def is_trusted(memory: Array) -> bool:
 
 
 def noise_factor(memory: Array, least: float, most: float) -> float:
-    """By what a source's configured variance is multiplied: as learnt, within the bounds."""
-    return float(min(max(1 + memory[NOISE_EXCESS], least), most))
+    """By what a source's configured variance is multiplied: as learnt, within bounds; a little more or less is chance."""
+    excess = float(memory[NOISE_EXCESS])
+    beyond = max(0.0, excess - CHANCE) + min(0.0, excess + CHANCE)
+    return min(max(1 + beyond, least), most)
 
 
 def noisy_factor(memory: Array) -> float:

@@ -23,7 +23,17 @@ from fusiond import alignment, bank, health
 from fusiond.earth import Array, mat_ne
 from fusiond.motion import carried, constrain, watch
 from fusiond.observe import MODELS, gnss_velocity, wheel_speed
-from fusiond.observe.model import CLUTTER, COMPANION, CORRELATION, NOISE_LEAST, NOISE_MOST, SHARED, VALUES, Observation
+from fusiond.observe.model import (
+    CLUTTER,
+    COMPANION,
+    CORRELATION,
+    NOISE_LEAST,
+    NOISE_MOST,
+    SHARED,
+    VALUES,
+    Observation,
+    with_rate_noise,
+)
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
@@ -39,6 +49,7 @@ from fusiond.state import (
     POSITION,
     POSITION_E,
     RATE_B,
+    RATE_VARIANCE,
     RESETS,
     RUNNING,
     T_ALIKE,
@@ -86,6 +97,7 @@ ROW = np.dtype(
 )
 Rows = NDArray[Any]  # structured, of dtype ROW
 
+LEAST_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
 OUTAGE_NS = 10_000_000_000  # a source silent for longer, or not fused for longer before it was rejected, comes back anew
 SUSPECT = 6  # times gnss_reset_s, where the receiver's velocity is not trusted
@@ -312,6 +324,7 @@ def advance(state: FilterState, t_ns: int, imu: Any | None, plan: Plan) -> None:
     propagate(state, dt, force_0 + middle * force_change, rate_0 + middle * rate_change, plan.noise)
     auxiliary[FORCE_B] = force_0 + end * force_change
     auxiliary[RATE_B] = rate_0 + end * rate_change
+    auxiliary[RATE_VARIANCE] = plan.noise.gyro / (span * 1e-9) * ((1 - end) * (1 - end) + end * end)
 
 
 def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
@@ -354,15 +367,19 @@ def _choose(state: FilterState, row: Any, imu: Any | None, plan: Plan) -> None:
         hypothesis = state.hypothesis(i)
         seen = MODELS[model].observe(hypothesis, values, parameters)
         assert seen is not None, "a source's model always observes"
-        seen, certain = seen._replace(variance=seen.variance * parameters[SHARED]), None
+        seen, certain = _shared(hypothesis, seen, parameters), None
         if model == MODEL["wheel_speed"]:
-            certain = wheel_speed.observe(hypothesis, values, parameters, certain=True)
-            certain = certain._replace(variance=certain.variance * parameters[SHARED])
+            certain = _shared(hypothesis, wheel_speed.observe(hypothesis, values, parameters, certain=True), parameters)
         bank.take(state, i, hypothesis, seen, plan.gates[len(seen.innovation)], factor, certain)
     own[T_FUSED] = t_ns
     if model == MODEL["gnss_position"]:
         stamps[T_POSITION] = t_ns
     bank.settle(state, plan)
+
+
+def _shared(state: FilterState, seen: Observation, parameters: Array) -> Observation:
+    """An observation with what it shares with others of its group, and with the gyro's noise on the lever arm."""
+    return with_rate_noise(state, seen._replace(variance=seen.variance * parameters[SHARED]))
 
 
 def remember(memory: Array, model: int, values: Array) -> None:
@@ -398,6 +415,7 @@ def _keep_sample(state: FilterState, t_ns: int, values: Array, plan: Plan) -> No
     same, _ = health.arrive(memory, own, values, t_ns)
     health.judge_repetition(memory, own, same, t_ns)
     stamps[T_IMU] = t_ns
+    auxiliary[RATE_VARIANCE] = plan.noise.gyro / max(dt, LEAST_SPAN) if dt > 0 else 0.0
     auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = values[0:3]
     auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = values[3:6]
     watch(state, values[0:3], values[3:6], dt, plan)
@@ -414,7 +432,7 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     assert seen is not None, "a source's model always observes"
     m = len(seen.innovation)
     predicted = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian)
-    given = seen.variance * parameters[SHARED]
+    given = _shared(state, seen, parameters).variance
     learnt = given * health.noise_factor(memory, parameters[NOISE_LEAST], parameters[NOISE_MOST])
     row["innovation"][:m], row["variance"][:m] = seen.innovation, predicted + learnt
     factor = _factor(stamps, model, values, parameters, t_ns)
@@ -433,13 +451,12 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     seen = seen._replace(variance=learnt * health.noisy_factor(memory))
     ratio, fused = update(state, seen, plan.gates[m], factor, trusted, float(parameters[CLUTTER]))
     row["ratio"] = memory[LAST_RATIO] = ratio
-    if fused:
-        stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
-    elif model != MODEL["wheel_speed"] and _locked_out(state, source, seen, t_ns, plan):
+    if not fused and model != MODEL["wheel_speed"] and _locked_out(state, source, seen, t_ns, plan):
         _reset_block(state, seen, model)
         health.begin(memory)
         fused = True
     if fused:
+        stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
         stamps[T_FUSED] = t_ns
         if model == MODEL["gnss_position"]:
             state.stamps[T_POSITION] = t_ns

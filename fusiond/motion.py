@@ -6,11 +6,13 @@ from fusiond.earth import Array
 from fusiond.elementary import exp, square
 from fusiond.health import is_trusted
 from fusiond.observe import CONSTRAINTS
+from fusiond.observe.model import with_rate_noise
 from fusiond.plan import SECOND, Plan
 from fusiond.state import (
     CONSTRAINT_FUSED,
     CONSTRAINT_RATIO,
     CONSTRAINT_REJECTED,
+    INTERVAL,
     LAST_VALUE,
     MEAN_FORCE_B,
     MEAN_RATE_B,
@@ -27,6 +29,7 @@ from fusiond.state import (
 from fusiond.update import update
 
 MEAN_TIME = 0.5  # s, time constant of the exponential means
+OWN_SCATTER = 3 * 1.5 * 1.5  # of white noise of unit density in three axes, and a margin of a half
 MEAN_FILLED = 0.8  # weight from which a mean is used: 0.8 s after its begin
 GNSS_FRESH_NS = 2 * SECOND  # a GNSS velocity older than this tells nothing of being carried
 CARRIED = 1.0  # m/s: slower than this no vehicle is called carried
@@ -73,9 +76,11 @@ def stands(state: FilterState, plan: Plan) -> bool:
     motion, auxiliary = plan.motion, state.auxiliary
     if not motion.standstill or auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
         return False
-    if auxiliary[SCATTER_FORCE] > square(motion.still_accel_mps2):
+    interval = state.memory[plan.imu_source, INTERVAL] if plan.wheels else 0.0
+    own = OWN_SCATTER / interval if interval > 0 else 0.0  # wheels at zero tell what the inertial sensor's noise hides
+    if auxiliary[SCATTER_FORCE] > max(square(motion.still_accel_mps2), own * plan.noise.accel):
         return False
-    if auxiliary[SCATTER_RATE] > square(plan.still_gyro):
+    if auxiliary[SCATTER_RATE] > max(square(plan.still_gyro), own * plan.noise.gyro):
         return False
     fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
     if plan.wheels and not fresh:
@@ -116,7 +121,7 @@ def _apply(state: FilterState, which: int, plan: Plan, factor: float = 1.0) -> b
     seen = CONSTRAINTS[which].observe(state, parameters, parameters)
     if seen is None:
         return False
-    ratio, fused = update(state, seen, plan.gates[len(seen.innovation)], factor)
+    ratio, fused = update(state, with_rate_noise(state, seen), plan.gates[len(seen.innovation)], factor)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     counts = CONSTRAINT_FUSED if fused else CONSTRAINT_REJECTED
     state.stamps[counts.start + which] += 1

@@ -18,10 +18,12 @@ from fusiond.state import (
     ATTITUDE,
     GYRO_BIAS,
     GYRO_BIAS_B,
+    MEAN_RATE_B,
     MOUNT,
     MOUNT_ERROR,
     QUATERNION_EB,
     RATE_B,
+    RATE_VARIANCE,
     VELOCITY,
     VELOCITY_E,
     FilterState,
@@ -58,6 +60,12 @@ class Observation(NamedTuple):
     variance: Array
 
 
+def with_rate_noise(state: FilterState, seen: Observation) -> Observation:
+    """The angular rate enters over a lever arm: its white noise does as well, as its bias would."""
+    by_rate = seen.jacobian[:, GYRO_BIAS]
+    return seen._replace(variance=seen.variance + state.auxiliary[RATE_VARIANCE] * np.einsum("ij,ij->i", by_rate, by_rate))
+
+
 def mat_eb(state: FilterState) -> Array:
     return matrix(state.nominal[QUATERNION_EB])
 
@@ -88,6 +96,8 @@ def point_velocity_v(state: FilterState, point_b: Array) -> tuple[Array, Array]:
     jacobian[:, VELOCITY] = rotation_vb @ rotation_eb.T
     jacobian[:, ATTITUDE] = rotation_vb @ rotation_eb.T @ skew(x[VELOCITY_E])
     jacobian[:, GYRO_BIAS] = rotation_vb @ skew(point_b)
-    jacobian[:, MOUNT_ERROR.start] = by_pitch @ velocity_b
-    jacobian[:, MOUNT_ERROR.start + 1] = by_yaw @ velocity_b
+    # with the mean rate: the noise of the rate itself is in the innovation too, and their product would be a bias
+    smooth_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(state.auxiliary[MEAN_RATE_B] - x[GYRO_BIAS_B], point_b)
+    jacobian[:, MOUNT_ERROR.start] = by_pitch @ smooth_b
+    jacobian[:, MOUNT_ERROR.start + 1] = by_yaw @ smooth_b
     return rotation_vb @ velocity_b, jacobian

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import common
 from fusiond import config
 from fusiond.daemon import Daemon, punctual_loop
 from fusiond.messages import StateMessage
+from fusiond.sections import Config
 from fusiond_adapters.outputs import LiveOutput
 
 DEADLINE = 15.0  # s, for anything awaited
@@ -28,7 +29,7 @@ BO_ 256 AXLE: 8 ECU
 """
 
 
-def configuration(folder: Path, connection: str, more: str = "", channel: str = "none") -> config.Config:
+def configuration(folder: Path, connection: str, more: str = "", channel: str = "none") -> Config:
     """One link, one virtual bus, standing vehicle with a given heading."""
     (folder / "axle.dbc").write_text(DBC)
     text = f"""
@@ -108,8 +109,8 @@ class Running:
 
     def __init__(
         self,
-        settings: config.Config,
-        load: Callable[[], config.Config] | None = None,
+        settings: Config,
+        load: Callable[[], Config] | None = None,
         *,
         outputs: Sequence[LiveOutput] = (),
         zenoh: bool = False,
@@ -169,8 +170,8 @@ class Running:
 
 @contextmanager
 def running(
-    settings: config.Config,
-    load: Callable[[], config.Config] | None = None,
+    settings: Config,
+    load: Callable[[], Config] | None = None,
     *,
     outputs: Sequence[LiveOutput] = (),
     zenoh: bool = False,

@@ -258,7 +258,7 @@ def test_wrong_usage(replay: Run, arguments: list[str], complaint: str) -> None:
 def test_wrong_configuration_is_told_by_line(run: Run, folder: Path) -> None:
     for text, complaint in (
         ("[vehicle\n", "not valid TOML"),
-        ("[vehicle]\nnam = 'x'\n", "bad.toml:2: vehicle.nam: unknown key; allowed: name"),
+        ("[vehicle]\nnam = 'x'\n", "bad.toml:2: vehicle.nam: unknown key; allowed: geoid_m, name"),
     ):
         (folder / "bad.toml").write_text(text)
         for command in (["check"], ["replay", str(folder / "drive.tlog")], ["simulate", "--out", str(folder / "never")]):

@@ -23,6 +23,7 @@ from fusiond import config
 from fusiond.estimate import Mode
 from fusiond.messages import StateMessage, encode
 from fusiond.replay import Replay, Wants
+from fusiond.sections import Config
 from fusiond_adapters.logs.merge import open_logs
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
@@ -325,7 +326,7 @@ def test_reload(tmp_path: Path) -> None:
             run.until(lambda: source.inbox.received == 1)
 
 
-def replayed(settings: config.Config, logs: list[str]) -> list[bytes]:
+def replayed(settings: Config, logs: list[str]) -> list[bytes]:
     """What a replay of recordings publishes."""
     told: list[bytes] = []
     wants = Wants(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])

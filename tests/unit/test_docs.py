@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from fusiond import config
+from fusiond import config, sections
 from fusiond.simulation import scenario
 
 ROOT = Path(__file__).parents[2]
@@ -47,7 +47,7 @@ def test_tables_of_keys_are_up_to_date(name: str) -> None:
 
 def test_every_key_is_in_the_tables() -> None:
     text = (DOCS / "configuration.md").read_text(encoding="utf-8")
-    for section in (config.Filter, config.Motion, config.Gnss, config.Wheel, config.Record):
+    for section in (sections.Filter, sections.Motion, sections.Gnss, sections.Wheel, sections.Record):
         assert all(f"\n| `{key}` |" in text for key in section.__struct_fields__)
     assert "`directory`" not in text
 

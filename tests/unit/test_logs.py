@@ -15,6 +15,7 @@ import pytest
 
 from fusiond import config
 from fusiond.measurements import Received, WheelSpeed
+from fusiond.sections import Config
 from fusiond_adapters.logs import LogError, LogInput
 from fusiond_adapters.logs.merge import LogSet, open_logs
 from fusiond_adapters.logs.tlog import read_tlog
@@ -27,7 +28,7 @@ WHEELS = {"front_right": "FR", "front_left": "FL", "rear_right": "RR", "rear_lef
 WHEEL_ID = 0x0AA
 
 
-def configured(bus: str = "can0", channel: str = "", more: str = "", imu: str = "HIGHRES_IMU") -> config.Config:
+def configured(bus: str = "can0", channel: str = "", more: str = "", imu: str = "HIGHRES_IMU") -> Config:
     wheels = "".join(
         f'[wheel.{name}]\nbus = "{bus}"\nmessage = "WHEEL_SPEEDS"\nsignal = "WHEEL_SPEED_{signal}"\n'
         for name, signal in WHEELS.items()
@@ -54,7 +55,7 @@ def records(count: int = 20, first_us: int = START_US, step_us: int = 10_000) ->
     return made
 
 
-def events(path: Path, settings: config.Config | None = None) -> tuple[list[Received], dict[str, int]]:
+def events(path: Path, settings: Config | None = None) -> tuple[list[Received], dict[str, int]]:
     logs = open_logs([path], settings or configured())
     found = list(logs)
     return found, logs.counts[str(path)]
@@ -355,7 +356,7 @@ def test_the_only_channel_is_taken_for_the_only_bus(tmp_path: Path) -> None:
     ],
 )
 def test_channels_of_nobody_are_said(
-    tmp_path: Path, settings: config.Config, channels: tuple[str, ...], complaint: str
+    tmp_path: Path, settings: Config, channels: tuple[str, ...], complaint: str
 ) -> None:
     with pytest.raises(LogError, match=complaint):
         events(candump(tmp_path / "drive.log", *channels), settings)

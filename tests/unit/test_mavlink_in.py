@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from fusiond import config
 from fusiond.measurements import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, Received
+from fusiond.sections import Config
 from fusiond.toml_file import ConfigError
 from fusiond_adapters.mavlink import Dialect, FrameSplitter, MavlinkDecoder, frame_length, message_id
 
@@ -19,7 +20,7 @@ UNIX_US = 1_700_000_000_000_000
 T_NS = 1_700_000_000_250_000_000
 
 
-def configured(link: str = "", imu: str = "", gnss: str = "") -> config.Config:
+def configured(link: str = "", imu: str = "", gnss: str = "") -> Config:
     head = f'[mavlink.fc]\ndialect = "ardupilotmega"\n{link}\n'
     return config.parse(f'{head}[imu.imu0]\nlink = "fc"\n{imu}\n[gnss.gps0]\nlink = "fc"\n{gnss}')
 

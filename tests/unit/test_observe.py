@@ -28,6 +28,7 @@ from fusiond.rotation import matrix_from_euler, quaternion
 from fusiond.sections import Gnss, Motion, Wheel
 from fusiond.state import (
     GYRO_BIAS_B,
+    MEAN_RATE_B,
     MOUNT,
     POSITION_E,
     QUATERNION_EB,
@@ -96,7 +97,7 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     state = running_state(rng, size=WIDE_SIZE)
     slip = 0.1 if abs(speed) > 1 else 0.01
     state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
-    state.auxiliary[RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
+    state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
     return state
 
 

@@ -38,7 +38,7 @@ from fusiond.messages import (
 )
 from fusiond.publication import Publication
 from fusiond.replay import Replay, Wants
-from fusiond.sections import Zenoh
+from fusiond.sections import Config, Zenoh
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.outputs import Outbox, OutputLost
 from fusiond_adapters.zenoh import open_session
@@ -171,7 +171,7 @@ def settled_state(collector: Collector) -> bool:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[config.Config, Path, list[Message], Running]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, Path, list[Message], Running]:
     """One drive: configuration, black box, everything published, the daemon after its end."""
     folder, channel, collector = tmp_path_factory.mktemp("drive"), f"outputs-{next(CHANNELS)}", Collector()
     with driven(folder, channel, [collector], '[record]\nfolder = "box"\n') as (run, drive_until):
@@ -183,7 +183,7 @@ def told(messages: list[Message], kind: type[Message]) -> list[Message]:
     return [message for message in messages if type(message) is kind]
 
 
-def test_the_health_accounts_for_everything(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_the_health_accounts_for_everything(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     _, _, messages, _ = recorded
     healths = [message for message in messages if isinstance(message, HealthMessage)]
     health = healths[-1]
@@ -208,14 +208,14 @@ def test_the_health_accounts_for_everything(recorded: tuple[config.Config, Path,
     assert len(healths) <= len(seconds) + 1 + len(told(messages, EventMessage))
 
 
-def test_events_tell_of_modes_and_sources_once(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_events_tell_of_modes_and_sources_once(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     events = [(message.kind, message.subject) for message in recorded[2] if isinstance(message, EventMessage)]
     assert [subject for kind, subject in events if kind == "mode"] == ["aligning", "nominal"]
     found = [subject for kind, subject in events if kind == "source_found"]
     assert sorted(found) == ["gps0.position", "gps0.velocity", "imu0", "left", "right"]
 
 
-def test_every_measurement_is_told_of(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_every_measurement_is_told_of(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     _, _, messages, run = recorded
     innovations = [message for message in messages if isinstance(message, InnovationMessage)]
     wheels = [message for message in innovations if message.source == "left"]
@@ -231,7 +231,7 @@ def test_every_measurement_is_told_of(recorded: tuple[config.Config, Path, list[
     assert {message.source for message in innovations} == {"left", "right", "gps0.position", "gps0.velocity"}
 
 
-def test_no_covariance_is_torn(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_no_covariance_is_torn(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     """Whatever was published, as it lies here long after: symmetric, positive, and that of its own sigmas."""
     states = [message for message in recorded[2] if isinstance(message, StateAtInstant) and message.state is not None]
     assert {type(message) for message in states} == {StateMessage, SettledMessage}
@@ -247,7 +247,7 @@ def test_no_covariance_is_torn(recorded: tuple[config.Config, Path, list[Message
             state.covariance_position_m2 = state.covariance_velocity_m2ps2  # type: ignore[misc]
 
 
-def test_the_settled_state_lags_by_the_horizon(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_the_settled_state_lags_by_the_horizon(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     settings, _, messages, _ = recorded
     state, lags = None, []
     for message in messages:
@@ -261,7 +261,7 @@ def test_the_settled_state_lags_by_the_horizon(recorded: tuple[config.Config, Pa
     assert all(settings.filter.horizon_s <= lag < settings.filter.horizon_s + 0.5 for lag in lags)
 
 
-def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     """State, settled state, innovations and events are the same bytes; the health but for what the shell tells."""
     settings, box, live, _ = recorded
     again: list[Message] = []
@@ -280,7 +280,7 @@ def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[config.Config,
         }
 
 
-def test_info_and_config_say_what_runs(recorded: tuple[config.Config, Path, list[Message], Running]) -> None:
+def test_info_and_config_say_what_runs(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     settings, _, messages, _ = recorded
     info = next(message for message in messages if isinstance(message, InfoMessage))
     assert info.sources["left"] == "wheel_speed" and info.sources["imu0"] == "imu"
@@ -309,7 +309,7 @@ def test_a_reload_is_told(tmp_path: Path) -> None:
 class Player:
     """An engine and its publication, played by hand."""
 
-    def __init__(self, settings: config.Config) -> None:
+    def __init__(self, settings: Config) -> None:
         self.told: list[Message] = []
         self._engine = Engine(settings, 10.0, lambda since, message: self.told.extend(self._publication.at(since, message)))
         self._publication = Publication(settings, self._engine)
@@ -337,6 +337,7 @@ class Player:
 def test_a_reset_is_told_with_its_reason(tmp_path: Path) -> None:
     """A receiver that stays 300 m away is believed in the end; before that its measurements are told as rejected."""
     settings = configuration(tmp_path, "udpin:127.0.0.1:1")
+    settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, gnss_reset_s=10.0))
     player = Player(settings)
     player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
     messages = player.told
