@@ -75,7 +75,8 @@ cdef enum:
     FIRST_VELOCITY_N = 24
     CONSTRAINT_RATIO = 32
     RATE_VARIANCE = 35
-    AUXILIARY_SIZE = 36
+    SMOOTH_FORCE_B = 36
+    AUXILIARY_SIZE = 39
     LAST_VALUE = 0
     LAST_RATIO = 1
     NOISE_EXCESS = 2
@@ -146,6 +147,7 @@ cdef double COAST_RATE2 = strapdown.COAST_RATE * strapdown.COAST_RATE
 cdef double LONGEST_STEP = strapdown.LONGEST_STEP
 cdef double OWN_SCATTER = motion.OWN_SCATTER
 cdef double LEAST_SPAN = kernel.LEAST_SPAN
+cdef double SMOOTH_TIME = motion.SMOOTH_TIME
 cdef double MEAN_TIME = motion.MEAN_TIME
 cdef double MEAN_FILLED = motion.MEAN_FILLED
 cdef int64_t WHEEL_FRESH_NS = motion.WHEEL_FRESH_NS
@@ -197,7 +199,7 @@ def check_layout():
         ("HELD_RATE_B", HELD_RATE_B), ("FORCE_B", FORCE_B), ("RATE_B", RATE_B), ("MEAN_FORCE_B", MEAN_FORCE_B),
         ("MEAN_RATE_B", MEAN_RATE_B), ("CONSTRAINT_RATIO", CONSTRAINT_RATIO), ("CONSTRAINT_FUSED", CONSTRAINT_FUSED),
         ("CONSTRAINT_REJECTED", CONSTRAINT_REJECTED),
-        ("BIAS", BIAS), ("LAST_INNOVATION", LAST_INNOVATION), ("BELIEF", NOMINAL), ("ANTENNA_B", ANTENNA_B), ("DELAYS", DELAYS), ("ANTENNA_ERROR", ANTENNA_ERROR), ("DELAYS_ERROR", DELAYS_ERROR),
+        ("BIAS", BIAS), ("LAST_INNOVATION", LAST_INNOVATION), ("BELIEF", NOMINAL), ("ANTENNA_B", ANTENNA_B), ("SMOOTH_FORCE_B", SMOOTH_FORCE_B), ("DELAYS", DELAYS), ("ANTENNA_ERROR", ANTENNA_ERROR), ("DELAYS_ERROR", DELAYS_ERROR),
         ("REST_RATE_B", REST_RATE_B), ("FIRST_VELOCITY_N", FIRST_VELOCITY_N),
     ):
         assert getattr(layout, name).start == offset, name
@@ -634,6 +636,7 @@ cdef void calibrated_position(double* x, double* auxiliary, double* parameter, d
                               double* jacobian) noexcept nogil:
     """fusiond.observe.gnss_position._calibrated"""
     cdef double rate[3]
+    cdef double mean[3]
     cdef double arm[3]
     cdef double swing[3]
     cdef double back[3]
@@ -642,11 +645,12 @@ cdef void calibrated_position(double* x, double* auxiliary, double* parameter, d
     cdef int i, j
     for i in range(3):
         rate[i] = auxiliary[RATE_B + i] - x[GYRO_BIAS_B + i]
+        mean[i] = auxiliary[MEAN_RATE_B + i] - x[GYRO_BIAS_B + i]
         arm[i] = parameter[i] + x[ANTENNA_B + i]
     cross(rate, arm, swing)
     matrix_product(to_n, c, turned)
     skew_rows(turned, arm, -delay, jacobian, 3, GYRO_BIAS)
-    skew_rows(turned, rate, -delay, jacobian, 3, ANTENNA_ERROR)
+    skew_rows(turned, mean, -delay, jacobian, 3, ANTENNA_ERROR)
     for i in range(3):
         along = 0.0
         for j in range(3):
@@ -658,21 +662,23 @@ cdef void calibrated_position(double* x, double* auxiliary, double* parameter, d
     times(c, back, lever)
 
 
-cdef void calibrated_velocity(double* x, double* auxiliary, double* rate, double* to_n, double* c, double* turned,
+cdef void calibrated_velocity(double* x, double* auxiliary, double* to_n, double* c, double* turned,
                               double* swing, double* jacobian, int m) noexcept nogil:
     """fusiond.observe.gnss_velocity._gained, taken off `swing`; the attitude's columns are those of the rest alone."""
     cdef double force_b[3]
+    cdef double mean[3]
     cdef double force[3]
     cdef double rest[3]
     cdef double delay = x[DELAYS] + x[DELAYS + 1], along
     cdef int i, j
     for i in range(3):
-        force_b[i] = auxiliary[FORCE_B + i] - x[ACCEL_BIAS_B + i]
+        force_b[i] = auxiliary[SMOOTH_FORCE_B + i] - x[ACCEL_BIAS_B + i]
+        mean[i] = auxiliary[MEAN_RATE_B + i] - x[GYRO_BIAS_B + i]
     times(c, force_b, force)
     gravity_e(x + POSITION_E, rest)
     rest[0] += 2 * EARTH_RATE * x[VELOCITY_E + 1]
     rest[1] -= 2 * EARTH_RATE * x[VELOCITY_E]
-    skew_rows(turned, rate, 1.0, jacobian, m, ANTENNA_ERROR)
+    skew_rows(turned, mean, 1.0, jacobian, m, ANTENNA_ERROR)
     skew_rows(to_n, rest, -delay, jacobian, m, ATTITUDE)
     for i in range(m):
         along = 0.0
@@ -717,7 +723,7 @@ cdef void gnss_velocity(double* x, double* auxiliary, double* row, double* param
         for j in range(3):
             seen.jacobian[i * n + VELOCITY + j] = to_n[3 * i + j]
     if learnt:
-        calibrated_velocity(x, auxiliary, rate, to_n, c, turned, swing, seen.jacobian, m)
+        calibrated_velocity(x, auxiliary, to_n, c, turned, swing, seen.jacobian, m)
     skew_rows(to_n, swing, -1.0, by_turn, m, ATTITUDE)
     for i in range(m):
         for j in range(3):
@@ -1517,11 +1523,14 @@ cdef class Kernel:
 
     cdef void watch(self, Row* row, double dt) noexcept nogil:
         cdef double* a = self.auxiliary
+        cdef double smooth = 1 - exponential(-dt / SMOOTH_TIME) if a[MEAN_WEIGHT] > 0 else 1.0
         cdef double share = 1 - exponential(-dt / MEAN_TIME)
         cdef double weight = a[MEAN_WEIGHT] + share * (1 - a[MEAN_WEIGHT])
         cdef double step
         cdef double off[3]
         cdef int i, which, mean
+        for i in range(3):
+            a[SMOOTH_FORCE_B + i] += smooth * (row.values[i] - a[SMOOTH_FORCE_B + i])
         a[MEAN_WEIGHT] = weight
         step = share / weight if weight > 0 else 1.0
         for which in range(2):

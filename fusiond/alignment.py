@@ -11,20 +11,24 @@ import math
 
 import numpy as np
 
-from fusiond.earth import Array, geodetic_trig, mat_ne_from_trig
+from fusiond.earth import Array, geodetic_trig, mat_ne, mat_ne_from_trig
 from fusiond.elementary import atan2, sin_cos, square
 from fusiond.health import arrive
 from fusiond.motion import MEAN_FILLED, ZERO_VELOCITY, watch
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed, zero_velocity
 from fusiond.observe.model import LEVER_ARM_B
 from fusiond.plan import IMU, MODEL, SECOND, Plan
-from fusiond.rotation import matrix_from_euler, product, quaternion
+from fusiond.rotation import matrix, matrix_from_euler, product, quaternion
 from fusiond.state import (
     ACCEL_BIAS,
     ALIGNING,
+    ANTENNA_B,
+    ANTENNA_ERROR,
     ATTITUDE,
     CALIBRATIONS,
     CHOOSING,
+    DELAYS,
+    DELAYS_ERROR,
     FIRST_VELOCITY_N,
     FIX_E,
     FIX_VARIANCE,
@@ -55,6 +59,7 @@ from fusiond.state import (
     T_STILL,
     VELOCITY,
     VELOCITY_E,
+    WIDE_SIZE,
     FilterState,
     T,
 )
@@ -216,15 +221,43 @@ def _place(
             covariance[i, i] = square(sigma)
     for i, first in enumerate(plan.calibration_variances, CALIBRATIONS):
         covariance[i, i] = first
+    if state.size == WIDE_SIZE:
+        _tie(state, _gain(state, measured_n))
+
+
+def _tie(state: FilterState, gain_n: Array) -> None:
+    """What the receiver's lever arm and delays are off by, the first position and velocity are off by as well: the antenna
+    less the arm, and where and how fast it was before the delay; `gain_n` (3,) [m/s^2] is the change of velocity."""
+    x, covariance = state.nominal, state.covariance
+    rotation = matrix(x[QUATERNION_EB])
+    gain_e = product(mat_ne(x[POSITION_E]).T, gain_n)
+    x[POSITION_E] += x[VELOCITY_E] * x[DELAYS][0] - product(rotation, x[ANTENNA_B])
+    x[VELOCITY_E] += gain_e * (x[DELAYS][0] + x[DELAYS][1])
+    by = np.zeros((VELOCITY.stop, DELAYS_ERROR.stop - ANTENNA_ERROR.start))  # position and velocity, by arm and delays
+    by[POSITION, 0:3] = -rotation
+    by[POSITION, 3] = x[VELOCITY_E]
+    by[VELOCITY, 3] = by[VELOCITY, 4] = gain_e
+    own = slice(ANTENNA_ERROR.start, DELAYS_ERROR.stop)
+    cross = by * np.diag(covariance)[own]
+    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(cross, by.T)
+    covariance[: VELOCITY.stop, own] = cross
+    covariance[own, : VELOCITY.stop] = cross.T
+
+
+def _gain(state: FilterState, velocity_n: Array | None) -> Array:
+    """Change of velocity (3,) [m/s^2] over the window before the start; none at rest, or where it was not measured."""
+    if velocity_n is None or state.stamps[T_STILL] != NEVER or state.stamps[T_FIRST_VELOCITY] == NEVER:
+        return np.zeros(3)
+    window = (state.stamps[T] - state.stamps[T_FIRST_VELOCITY]) * 1e-9
+    gained: Array = (velocity_n - state.auxiliary[FIRST_VELOCITY_N]) / window
+    return gained
 
 
 def _level(state: FilterState, velocity_n: Array | None, yaw: float) -> tuple[float, float]:
     """Roll and pitch [rad] at which the mean specific force is gravity's reaction and the vehicle's own acceleration."""
     force = state.auxiliary[MEAN_FORCE_B].copy()
-    if velocity_n is not None and state.stamps[T_STILL] == NEVER:
-        window = (state.stamps[T] - state.stamps[T_FIRST_VELOCITY]) * 1e-9
-        north, east, _ = (velocity_n - state.auxiliary[FIRST_VELOCITY_N]) / window
-        sine, cosine = sin_cos(yaw)
-        force[0] -= cosine * north + sine * east
-        force[1] -= cosine * east - sine * north
+    north, east, _ = _gain(state, velocity_n)
+    sine, cosine = sin_cos(yaw)
+    force[0] -= cosine * north + sine * east
+    force[1] -= cosine * east - sine * north
     return atan2(-force[1], -force[2]), atan2(force[0], math.sqrt(square(force[1]) + square(force[2])))

@@ -215,6 +215,13 @@ class OutputHealth(Message, frozen=True, kw_only=True):
     notes: Annotated[dict[str, str], _about("what else there is to tell, such as whether the autopilot uses it")]
 
 
+class Calibration(Message, frozen=True, kw_only=True):
+    """Something of the installation that is learnt."""
+
+    value: Annotated[float, _about("as learnt so far, in the unit that its name ends in")]
+    sigma: Annotated[float, _about("one standard deviation of it")]
+
+
 class HealthMessage(Message, frozen=True, kw_only=True):
     """How everything is, each second and at every change of mode, resets or sources, on fusiond/<vehicle>/health."""
 
@@ -231,6 +238,9 @@ class HealthMessage(Message, frozen=True, kw_only=True):
     sources: Annotated[dict[str, SourceHealth], _about("by name")]
     inputs: Annotated[dict[str, InputHealth], _about("by kind and name, such as mavlink.fc")]
     outputs: Annotated[dict[str, OutputHealth], _about("by name, such as zenoh")]
+    calibration: Annotated[
+        dict[str, Calibration], _about("what is learnt of the installation: what each is more than configured, by name")
+    ] = {}
 
 
 class InfoMessage(Message, frozen=True, kw_only=True):

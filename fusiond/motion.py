@@ -20,6 +20,7 @@ from fusiond.state import (
     NEVER,
     SCATTER_FORCE,
     SCATTER_RATE,
+    SMOOTH_FORCE_B,
     T_CONSTRAINT,
     T_LAST,
     T_STILL,
@@ -30,6 +31,7 @@ from fusiond.update import update
 
 MEAN_TIME = 0.5  # s, time constant of the exponential means
 OWN_SCATTER = 3 * 1.5 * 1.5  # of white noise of unit density in three axes, and a margin of a half
+SMOOTH_TIME = 0.08  # s, time constant of the mean force that delays are learnt with
 MEAN_FILLED = 0.8  # weight from which a mean is used: 0.8 s after its begin
 GNSS_FRESH_NS = 2 * SECOND  # a GNSS velocity older than this tells nothing of being carried
 CARRIED = 1.0  # m/s: slower than this no vehicle is called carried
@@ -41,6 +43,8 @@ def watch(state: FilterState, force_b: Array, rate_b: Array, dt: float, plan: Pl
     """Take one inertial sample, `dt` [s] after the last, into the means and scatters, and decide whether the vehicle
     stands: since when is in stamps[T_STILL]."""
     auxiliary = state.auxiliary
+    smooth = 1 - exp(-dt / SMOOTH_TIME)
+    auxiliary[SMOOTH_FORCE_B] += (smooth if auxiliary[MEAN_WEIGHT] > 0 else 1.0) * (force_b - auxiliary[SMOOTH_FORCE_B])
     share = 1 - exp(-dt / MEAN_TIME)
     weight = auxiliary[MEAN_WEIGHT] + share * (1 - auxiliary[MEAN_WEIGHT])
     auxiliary[MEAN_WEIGHT] = weight

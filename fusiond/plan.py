@@ -12,17 +12,19 @@ from fusiond.earth import Array
 from fusiond.elementary import square
 from fusiond.observe import CONSTRAINTS, MODELS, wheel_speed
 from fusiond.observe.model import CLUTTER, COMPANION, NOISE_LEAST, NOISE_MOST, PARAMETERS, SHARED
-from fusiond.sections import Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
+from fusiond.sections import Barometer, Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
 from fusiond.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
     DELAYS_ERROR,
     ERROR_SIZE,
     FURTHER_SCALES_ERROR,
+    HEIGHT_OFFSET_ERROR,
     MOUNT_ERROR,
     SCALE,
     WIDE_SIZE,
 )
+from fusiond.stored import StoredState
 from fusiond.strapdown import ProcessNoise
 from fusiond.update import chi_square, correlation_factor
 
@@ -45,6 +47,7 @@ class Plan:
     gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
     noise: ProcessNoise
     size: int  # of the error state
+    scales: tuple[str, ...]  # names of the wheel scales, by their number
     calibration_variances: Array  # (size - CALIBRATIONS,): first ones
     imu_source: int
     wheels: tuple[int, ...]  # indices of the sources that are wheels
@@ -63,6 +66,8 @@ class Plan:
     filter: Filter
     motion: Motion
     imu: Imu
+    stored: StoredState | None  # of an earlier run, for a hot start
+    stored_most_ns: int  # how old it may be
 
 
 def section_of(source: str, model: int, config: Config) -> Any:
@@ -73,8 +78,8 @@ def section_of(source: str, model: int, config: Config) -> Any:
     return table[source.removesuffix(MODELS[model].suffix)]
 
 
-def plan(config: Config) -> Plan:
-    """Lay a configuration out for the kernel."""
+def plan(config: Config, stored: StoredState | None = None) -> Plan:
+    """Lay a configuration out for the kernel, with what an earlier run has stored."""
     found = dict.fromkeys(config.imu, IMU)
     for number, model in enumerate(MODELS):
         if model.table is not None:
@@ -99,6 +104,7 @@ def plan(config: Config) -> Plan:
             calibrations=tuple(walks.tolist()),
         ),
         size=CALIBRATIONS + len(first),
+        scales=_scale_names(config),
         calibration_variances=first,
         imu_source=models.index(IMU),
         wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
@@ -117,6 +123,8 @@ def plan(config: Config) -> Plan:
         filter=settings,
         motion=motion,
         imu=imu,
+        stored=stored,
+        stored_most_ns=nanoseconds(config.state.max_age_s),
     )
 
 
@@ -128,6 +136,8 @@ def _parameters(source: str, sources: tuple[str, ...], model: int, config: Confi
     row = MODELS[model].parameters(section)
     row[NOISE_LEAST], row[NOISE_MOST] = square(section.noise_least), square(section.noise_most)
     row[SHARED], row[COMPANION] = _shared(section, model, config), -1
+    if model == MODEL["barometric_height"]:
+        return row
     if model == MODEL["wheel_speed"]:
         row[wheel_speed.SCALE_STATE] = _scale_state(wheel_groups(config)[source])
         return row
@@ -138,16 +148,25 @@ def _parameters(source: str, sources: tuple[str, ...], model: int, config: Confi
     return row
 
 
-def _shared(section: Gnss | Wheel, model: int, config: Config) -> float:
+def _shared(section: Gnss | Wheel | Barometer, model: int, config: Config) -> float:
     """By what each variance s_i^2 of a group grows so that all of them, fused one by one, are worth no more than their
     shared error s_c allows (THEORY A5): with 1 + s_c^2 sum 1 / s_j^2 they are worth s_c^2 + 1 / sum 1 / s_j^2 together."""
-    if section.group is None or model == MODEL["gnss_velocity"]:
+    if isinstance(section, Barometer) or section.group is None or model == MODEL["gnss_velocity"]:
         return 1.0
     if isinstance(section, Wheel):
         sigmas = [wheel.sigma_mps for wheel in config.wheel.values() if wheel.group == section.group]
         return 1 + square(section.shared_sigma_mps) * sum(1 / square(sigma) for sigma in sigmas)
     sigmas = [gnss.position_sigma_m for gnss in config.gnss.values() if gnss.group == section.group]
     return 1 + square(section.shared_sigma_m) * sum(1 / square(sigma) for sigma in sigmas)
+
+
+def _scale_names(config: Config) -> tuple[str, ...]:
+    """Of each wheel scale: the one of all, or with the wheels that share it."""
+    groups = wheel_groups(config)
+    if len(set(groups.values())) < 2:
+        return ("wheel_scale",)
+    wheels = ["_".join(name for name, group in groups.items() if group == number) for number in sorted(set(groups.values()))]
+    return tuple(f"wheel_scale_{names}" for names in wheels)
 
 
 def _scale_state(group: int) -> int:
@@ -168,5 +187,8 @@ def _calibrations(config: Config) -> tuple[Array, Array]:
     for gnss in filter(calibrated, config.gnss.values()):
         first[ANTENNA_ERROR] = square(gnss.lever_arm_sigma_m)
         first[DELAYS_ERROR] = square(gnss.delay_sigma_ms * 1e-3), square(gnss.velocity_delay_sigma_ms * 1e-3)
+    for barometer in config.barometer.values():
+        first[HEIGHT_OFFSET_ERROR] = square(barometer.offset_sigma_m)
+        walks[HEIGHT_OFFSET_ERROR] = square(barometer.offset_walk_m)
     size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
     return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

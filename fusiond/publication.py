@@ -10,22 +10,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import msgspec
 import numpy as np
 
 from fusiond import __version__
+from fusiond.calibration import calibrations
 from fusiond.clock import ClockReport
 from fusiond.engine import FIELDS, RATE_DENOMINATOR, Engine, totals
 from fusiond.estimate import Mode
 from fusiond.fusion import Fusion, Receipt
+from fusiond.health import STATUSES
 from fusiond.innovations import Innovations
 from fusiond.kernel import Kernel
 from fusiond.measurements import Received
 from fusiond.messages import (
     MESSAGES,
     SCHEMA_VERSION,
+    Calibration,
     ClockHealth,
     ConfigMessage,
     EventMessage,
@@ -36,8 +39,10 @@ from fusiond.messages import (
     Message,
     OutcomeCounts,
     OutputHealth,
+    Probabilities,
     Severity,
     SourceHealth,
+    SourceStatus,
     StateMessage,
     settled_message,
 )
@@ -48,6 +53,7 @@ from fusiond.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
 
 SECOND = 1_000_000_000  # ns
 HEALTH_NS = SECOND  # between two of them, when nothing changes
+LOOK_NS = SECOND // 10  # between two looks at what the sources are held to be
 ABSENT_NS = 2 * SECOND  # a source that has brought nothing for so long is not present
 SEVERITY: Mapping[Mode, Severity] = {
     Mode.ALIGNING: "notice",
@@ -122,6 +128,10 @@ class Publication:
             sources=self._sources.health(state.t_ns),
             inputs=dict(around.inputs),
             outputs=dict(around.outputs),
+            calibration={
+                name: Calibration(value=value, sigma=sigma)
+                for name, (value, sigma) in calibrations(self._engine.fusion.plan, self._engine.fusion.history.head).items()
+            },
         )
 
 
@@ -153,6 +163,7 @@ class Sources:
 
     def health(self, t_ns: int) -> dict[str, SourceHealth]:
         fusion, present = self._fusion, self.present(t_ns)
+        beliefs = fusion.beliefs(t_ns)
         clocks, nis, counts = fusion.clock.report(), nis_means(fusion), fusion.history.counts.tolist()
         found = {}
         for i, source in enumerate(fusion.plan.sources):
@@ -165,6 +176,9 @@ class Sources:
                 test_ratio=_last_ratio(fusion, i),
                 nis_mean=nis.get(source),
                 clock=_clock_health(self._clocks.get(source), clocks),
+                probabilities=Probabilities(**dict(zip(STATUSES, beliefs[source].probabilities, strict=True))),
+                status=cast(SourceStatus, beliefs[source].status),
+                reason=beliefs[source].reason or None,
             )
         return found
 
@@ -179,6 +193,8 @@ class Changes:
         self._resets = self._blown = 0
         self._started: int = NEVER
         self._present: frozenset[str] = frozenset()
+        self._statuses = dict.fromkeys(fusion.plan.sources, "nominal")
+        self._look_ns: int = NEVER
 
     def since(self, state: StateMessage, present: frozenset[str]) -> Iterator[EventMessage]:
         """The events between the tick before and this one."""
@@ -203,6 +219,14 @@ class Changes:
             text = f"{source}: nothing received for {ABSENT_NS / SECOND:g} s"
             yield event(kind="source_lost", severity="warning", subject=source, text=text)
         self._present = present
+        if state.t_ns >= self._look_ns:
+            self._look_ns = state.t_ns + LOOK_NS
+            for source, belief in self._fusion.beliefs(state.t_ns).items():
+                if belief.status not in ("absent", self._statuses[source]):  # that it is gone is told above
+                    self._statuses[source] = belief.status
+                    good = belief.status == "nominal"
+                    text = f"{source}: {belief.status}" + (f": {belief.reason}" if belief.reason else "")
+                    yield event(kind="source_status", severity="info" if good else "warning", subject=source, text=text)
 
     def _why(self) -> str:
         """Why the state was reset, as far as it can be seen from the state now."""
@@ -214,7 +238,7 @@ class Changes:
             return f"a hole in the data of more than {settings.restart_gap_s:g} s; aligning anew"
         believed = [name for i, name in enumerate(fusion.plan.sources) if head.memory[i, LAST_RATIO] > 1
                     and head.source_stamps[i, T_REJECTED] == NEVER]  # fmt: skip
-        return f"{' and '.join(believed) or 'GNSS'} rejected for {settings.gnss_reset_s:g} s, now believed again"
+        return f"{' and '.join(believed) or 'GNSS'} was rejected, off alike all the time, and is now believed again"
 
 
 def nis_means(fusion: Fusion) -> dict[str, float]:

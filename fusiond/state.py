@@ -61,7 +61,8 @@ FIX_E = slice(27, 30)  # m, last GNSS antenna position before the start
 FIX_VARIANCE = slice(30, 32)  # m^2, horizontal, vertical
 CONSTRAINT_RATIO = slice(32, 35)  # last test ratios: non-holonomic, zero velocity, zero rotation
 RATE_VARIANCE = 35  # (rad/s)^2, white noise of RATE_B, per axis
-AUXILIARY_SIZE = 36
+SMOOTH_FORCE_B = slice(36, 39)  # m/s^2, mean over the delays of receivers
+AUXILIARY_SIZE = 39
 
 # Remembered of each source: columns of FilterState.memory
 LAST_VALUE = 0  # last reading of a wheel [m/s]; of a GNSS velocity, the least horizontal speed that it leaves possible

@@ -17,6 +17,7 @@ from fusiond.observe.model import (
     Observation,
     Unusable,
     mat_eb,
+    mean_rate_b,
     rate_b,
     within,
 )
@@ -88,6 +89,6 @@ def _calibrated(state: FilterState, lever_b: Array, to_n: Array, jacobian: Array
     turned = to_n @ rotation
     jacobian[:, VELOCITY] = to_n * -delay
     jacobian[:, GYRO_BIAS] = turned @ skew(lever_b) * -delay
-    jacobian[:, ANTENNA_ERROR] = turned - turned @ skew(rate) * delay
+    jacobian[:, ANTENNA_ERROR] = turned - turned @ skew(mean_rate_b(state)) * delay
     jacobian[:, DELAYS_ERROR.start] = -(to_n @ x[VELOCITY_E] + turned @ swing_b)
     return rotation @ (lever_b - swing_b * delay)

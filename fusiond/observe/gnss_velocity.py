@@ -17,6 +17,7 @@ from fusiond.observe.model import (
     SPEED_LIMIT,
     Observation,
     mat_eb,
+    mean_rate_b,
     rate_b,
     within,
 )
@@ -30,9 +31,9 @@ from fusiond.state import (
     ATTITUDE,
     DELAYS,
     DELAYS_ERROR,
-    FORCE_B,
     GYRO_BIAS,
     POSITION_E,
+    SMOOTH_FORCE_B,
     VELOCITY,
     VELOCITY_E,
     FilterState,
@@ -91,11 +92,11 @@ def _gained(state: FilterState, to_n: Array, rotation: Array, jacobian: Array) -
     delays, velocity and accelerometer bias, and what of the attitude's does not turn with the specific force."""
     x = state.nominal
     delay = float(x[DELAYS.start] + x[DELAYS.start + 1])
-    force_e = rotation @ (state.auxiliary[FORCE_B] - x[ACCEL_BIAS_B])
+    force_e = rotation @ (state.auxiliary[SMOOTH_FORCE_B] - x[ACCEL_BIAS_B])
     rest = gravity_e(x[POSITION_E]) - 2 * EARTH_RATE_SKEW @ x[VELOCITY_E]
     jacobian[:, VELOCITY] += to_n @ EARTH_RATE_SKEW * (2 * delay)
     jacobian[:, ACCEL_BIAS] = to_n @ rotation * delay
-    jacobian[:, ANTENNA_ERROR] = to_n @ rotation @ skew(rate_b(state))
+    jacobian[:, ANTENNA_ERROR] = to_n @ rotation @ skew(mean_rate_b(state))
     jacobian[:, DELAYS_ERROR] = np.outer(-to_n @ (force_e + rest), np.ones(2))
     jacobian[:, ATTITUDE] = -to_n @ skew(rest) * delay
     return (force_e + rest) * delay

@@ -66,6 +66,13 @@ def with_rate_noise(state: FilterState, seen: Observation) -> Observation:
     return seen._replace(variance=seen.variance + state.auxiliary[RATE_VARIANCE] * np.einsum("ij,ij->i", by_rate, by_rate))
 
 
+def mean_rate_b(state: FilterState) -> Array:
+    """Mean angular rate (3,) [rad/s] of the last half second, freed of bias: for derivatives. The noise of the rate itself is
+    in the innovation too, or looks like motion: their product would be a bias, or knowledge that is none."""
+    rate: Array = state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
+    return rate
+
+
 def mat_eb(state: FilterState) -> Array:
     return matrix(state.nominal[QUATERNION_EB])
 
@@ -96,8 +103,7 @@ def point_velocity_v(state: FilterState, point_b: Array) -> tuple[Array, Array]:
     jacobian[:, VELOCITY] = rotation_vb @ rotation_eb.T
     jacobian[:, ATTITUDE] = rotation_vb @ rotation_eb.T @ skew(x[VELOCITY_E])
     jacobian[:, GYRO_BIAS] = rotation_vb @ skew(point_b)
-    # with the mean rate: the noise of the rate itself is in the innovation too, and their product would be a bias
-    smooth_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(state.auxiliary[MEAN_RATE_B] - x[GYRO_BIAS_B], point_b)
+    smooth_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(mean_rate_b(state), point_b)
     jacobian[:, MOUNT_ERROR.start] = by_pitch @ smooth_b
     jacobian[:, MOUNT_ERROR.start + 1] = by_yaw @ smooth_b
     return rotation_vb @ velocity_b, jacobian

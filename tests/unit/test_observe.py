@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from fusiond.earth import Array, ecef, mat_ne
-from fusiond.measurements import GnssPosition, GnssVelocity, WheelSpeed
+from fusiond.measurements import GnssPosition, GnssVelocity, Pressure, WheelSpeed
 from fusiond.observe import (
     CONSTRAINTS,
     MODELS,
+    barometric_height,
     gnss_position,
     gnss_velocity,
     non_holonomic,
@@ -25,7 +26,7 @@ from fusiond.observe import (
 from fusiond.observe.model import LEVER_ARM_B, PARAMETERS, VALUES, mat_eb, mat_vb, rate_b
 from fusiond.observe.wheel_speed import direction
 from fusiond.rotation import matrix_from_euler, quaternion
-from fusiond.sections import Gnss, Motion, Wheel
+from fusiond.sections import Barometer, Gnss, Motion, Wheel
 from fusiond.state import (
     GYRO_BIAS_B,
     MEAN_RATE_B,
@@ -33,6 +34,7 @@ from fusiond.state import (
     POSITION_E,
     QUATERNION_EB,
     RATE_B,
+    SMOOTH_FORCE_B,
     VELOCITY_E,
     WHEEL_SCALE,
     WIDE_SIZE,
@@ -45,6 +47,7 @@ GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
 STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])
+BAROMETER = Barometer(link="l")
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
 
 
@@ -76,6 +79,12 @@ CASES = {
     "velocity 2-D, learning": Case(
         "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0), LEARNT), gnss_velocity.parameters(LEARNT), 10.0
     ),
+    "barometer": Case(
+        "barometric_height",
+        barometric_height.values(Pressure(95_000.0, 280.0), BAROMETER),
+        barometric_height.parameters(BAROMETER),
+        10.0,
+    ),
     "wheel signed": wheel_case(10.0, 10.0, unsigned=False),
     "wheel signed in reverse": wheel_case(-3.0, -3.1, unsigned=False),
     "wheel signed at rest": wheel_case(0.0, 0.0, unsigned=False),
@@ -97,6 +106,7 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     state = running_state(rng, size=WIDE_SIZE)
     slip = 0.1 if abs(speed) > 1 else 0.01
     state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
+    state.auxiliary[SMOOTH_FORCE_B] = rng.normal((0.0, 0.0, -9.8), 0.5)
     state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
     return state
 

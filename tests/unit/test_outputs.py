@@ -341,7 +341,7 @@ def test_a_reset_is_told_with_its_reason(tmp_path: Path) -> None:
     player = Player(settings)
     player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
     messages = player.told
-    why = "gps0.position rejected for 10 s, now believed again"
+    why = "gps0.position was rejected, off alike all the time, and is now believed again"
     events = [message for message in messages if isinstance(message, EventMessage)]
     assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
     assert [message.subject for message in events if message.kind == "mode"] == [
