@@ -1,4 +1,4 @@
-"""Square, sine, cosine, arc tangent and exponential in plain IEEE arithmetic.
+"""Square, sine, cosine, arc tangent, exponential and logarithm in plain IEEE arithmetic.
 
 The C library picks its variants by the processor (with or without fused multiply-add), so its last bit is not the same
 everywhere. These are: the same operations in the same order give the same bits on every machine, here and in the
@@ -12,6 +12,16 @@ import math
 HALF_PI_HIGH, HALF_PI_LOW = 1.57079632673412561417, 6.07710050650619224932e-11
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 PI_LOW = 1.2246467991473531772e-16
+ROOT_HALF = 0.70710678118654752440
+LOG = (
+    6.666666666666735130e-01,
+    3.999999999940941908e-01,
+    2.857142874366239149e-01,
+    2.222219843214978396e-01,
+    1.818357216161805012e-01,
+    1.531383769920937332e-01,
+    1.479819860511658591e-01,
+)
 ATAN = (
     3.33333333333329318027e-01,
     -1.99999999998764832476e-01,
@@ -129,3 +139,21 @@ def exp(x: float) -> float:
     )
     y = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
     return math.ldexp(y, int(k))
+
+
+def log(x: float) -> float:
+    """Natural logarithm; minus infinity of 0, infinite of infinity, nan below 0 and of nan. Only here: no model that the
+    compiled kernel knows needs it."""
+    if not 0.0 < x < math.inf:
+        return -math.inf if x == 0.0 else x if x > 0.0 else math.nan
+    fraction, k = math.frexp(x)
+    if fraction < ROOT_HALF:
+        fraction, k = 2.0 * fraction, k - 1
+    f = fraction - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    w = z * z
+    odd = z * (LOG[0] + w * (LOG[2] + w * (LOG[4] + w * LOG[6])))
+    even = w * (LOG[1] + w * (LOG[3] + w * LOG[5]))
+    half = 0.5 * f * f
+    return k * LN2_HIGH - ((half - (s * (half + (odd + even)) + k * LN2_LOW)) - f)

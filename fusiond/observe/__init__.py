@@ -6,7 +6,15 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from fusiond.earth import Array
-from fusiond.observe import gnss_position, gnss_velocity, non_holonomic, wheel_speed, zero_rotation, zero_velocity
+from fusiond.observe import (
+    barometric_height,
+    gnss_position,
+    gnss_velocity,
+    non_holonomic,
+    wheel_speed,
+    zero_rotation,
+    zero_velocity,
+)
 from fusiond.observe.model import Observation
 from fusiond.state import FilterState
 
@@ -36,5 +44,13 @@ MODELS = (
     Model("non_holonomic", None, "", non_holonomic.parameters, no_values, non_holonomic.observe),
     Model("zero_velocity", None, "", zero_velocity.parameters, no_values, zero_velocity.observe),
     Model("zero_rotation", None, "", zero_rotation.parameters, no_values, zero_rotation.observe),
+    Model(
+        "barometric_height",
+        "barometer",
+        "",
+        barometric_height.parameters,
+        barometric_height.values,
+        barometric_height.observe,
+    ),
 )
 CONSTRAINTS = tuple(model for model in MODELS if model.table is None)

@@ -67,8 +67,8 @@ def with_rate_noise(state: FilterState, seen: Observation) -> Observation:
 
 
 def mean_rate_b(state: FilterState) -> Array:
-    """Mean angular rate (3,) [rad/s] of the last half second, freed of bias: for derivatives. The noise of the rate itself is
-    in the innovation too, or looks like motion: their product would be a bias, or knowledge that is none."""
+    """Mean angular rate (3,) [rad/s] of the last half second, freed of bias: for derivatives. The noise of the rate itself
+    is in the innovation too, or looks like motion: their product would be a bias, or knowledge that is none."""
     rate: Array = state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
     return rate
 

@@ -39,12 +39,13 @@ def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     """Speed [m/s], its variance (white noise, rounding to a quantum, quantum^2/12, and the reading's own), and the time over
     which its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the
     same from reading to reading. Raises Unusable."""
-    within((reading.speed,), SPEED_LIMIT, "impossible speed")
-    variance = square(wheel.sigma_mps) + square(wheel.quantum_mps) / 12 + square(reading.sigma)
-    alike = wheel.correlation_s
-    if abs(reading.speed) < wheel.least_mps:
-        return reading.speed, variance + square(wheel.least_mps) / 3, max(alike, SLOW_ALIKE)
-    return reading.speed, variance, alike
+    speed, sigma, quantum, own = reading.speed, wheel.sigma_mps, wheel.quantum_mps, reading.sigma
+    if not -SPEED_LIMIT <= speed <= SPEED_LIMIT:
+        within((speed,), SPEED_LIMIT, "impossible speed")
+    variance = sigma * sigma + quantum * quantum / 12 + own * own
+    if -wheel.least_mps < speed < wheel.least_mps:
+        return speed, variance + square(wheel.least_mps) / 3, max(wheel.correlation_s, SLOW_ALIKE)
+    return speed, variance, wheel.correlation_s
 
 
 def observe(state: FilterState, row: Array, parameter: Array, certain: bool = False) -> Observation:

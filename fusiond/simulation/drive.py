@@ -14,7 +14,7 @@ import numpy as np
 
 from fusiond.earth import Array
 from fusiond.measurements import Received
-from fusiond.simulation import gnss, imu, wheels
+from fusiond.simulation import barometer, gnss, imu, wheels
 from fusiond.simulation.chatter import FIRST_ID, TELEMETRY_HZ, traffic_rates
 from fusiond.simulation.gnss import Fixes
 from fusiond.simulation.scenario import WHEELS, Scenario, Transport
@@ -26,12 +26,14 @@ from fusiond.simulation.wire import (
     GnssMessages,
     Heartbeats,
     ImuMessages,
+    PressureMessages,
     Telemetry,
     TimeMessages,
     WheelFrames,
 )
 
 WHEEL_PHASE_S, STEERING_PHASE_S, SPEED_PHASE_S, BEACON_PHASE_S = 0.0013, 0.0027, 0.0041, 0.1  # beside whole instants
+PRESSURE_PHASE_S = 0.0119  # likewise
 TELEMETRY_PHASE_S, TRAFFIC_PHASE_S = 0.0007, 0.00037  # of the first; each further kind comes so much later again
 BEACON_SCATTER_S = 0.02  # SYSTEM_TIME and HEARTBEAT go out when the autopilot's scheduler finds the time
 GENERATORS = (
@@ -39,6 +41,7 @@ GENERATORS = (
     *WHEELS,
     *("imu_link", "gnss_link", "time_link", "heartbeat_link", "wheels_link", "steering_link", "speed_link", "beacons"),
     *("telemetry_link", "traffic_link", "traffic_data"),
+    *("pressure", "pressure_link"),
 )
 
 
@@ -54,12 +57,19 @@ class Drive:
     time: TimeMessages
     heartbeats: Heartbeats
     wheels: WheelFrames
+    barometer: PressureMessages
     chatter: tuple[CanFrames, ...]
     telemetry: tuple[Telemetry, ...]
 
     def events(self) -> Iterator[Received]:
         """The events in the order of receipt, as the log readers decode them with the matching configuration."""
-        streams = (self.imu.events(), self.gnss.events(), self.time.events(), self.wheels.events())
+        streams = (
+            self.imu.events(),
+            self.gnss.events(),
+            self.time.events(),
+            self.wheels.events(),
+            self.barometer.events(),
+        )
         return heapq.merge(*streams, key=lambda event: event.t_receive_ns)
 
 
@@ -90,7 +100,9 @@ class _Simulation:
         self.random = dict(zip(GENERATORS, map(np.random.default_rng, children), strict=True))
 
     def instants(self, rate_hz: float, phase_s: float) -> Array:
-        """Regular times [s] inside the drive."""
+        """Regular times [s] inside the drive; none at a rate of 0."""
+        if rate_hz == 0:
+            return np.empty(0)
         count = max(0, int((self.trajectory.duration - phase_s) * rate_hz + 1e-6) + 1)
         return phase_s + np.arange(count) / rate_hz
 
@@ -127,6 +139,9 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
     generators = (run.random["gnss_white"], run.random["gnss_drift"], run.random["gnss_velocity"])
     fixes = gnss.measure(scenario, run.trajectory, t_fix, generators)
     t_sample_ns, t_fix_ns, t_beacon_ns = run.unix(run.trajectory.t), run.unix(t_fix), run.unix(t_beacon)
+    t_pressure = run.instants(scenario.barometer.rate_hz, PRESSURE_PHASE_S)
+    t_pressure_ns, height = run.unix(t_pressure), np.interp(t_pressure, run.trajectory.t, truth.height)
+    pressures = barometer.measure(scenario.barometer, height, run.random["pressure"])
     t_fix_arrival_ns = t_fix_ns + round(scenario.gnss.delay_ms * 1e6)
     spoken = ~within(t_fix, scenario.gnss.outage_s)
     streams = [
@@ -136,10 +151,11 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
         run.send_mavlink(t_fix_arrival_ns, scenario.gnss.transport, "gnss_link", spoken),
         run.send_mavlink(t_beacon_ns, scenario.autopilot.transport, "time_link"),
         run.send_mavlink(t_beacon_ns, scenario.autopilot.transport, "heartbeat_link"),
+        run.send_mavlink(t_pressure_ns, scenario.barometer.transport, "pressure_link"),
     ]
     telemetry = _telemetry(run)
     counters = run.frame_counters([*streams, *telemetry.values()])
-    (i, t_i), (g, t_g), (s, t_s), (h, t_h) = (stream.receipt(scenario.host.offset_s) for stream in streams)
+    (i, t_i), (g, t_g), (s, t_s), (h, t_h), (p, t_p) = (stream.receipt(scenario.host.offset_s) for stream in streams)
     stamps = {
         "unix": t_fix_ns // 1000,
         "boot-arrival": run.clock.read(t_fix_arrival_ns) // 1000,
@@ -160,6 +176,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
         time=TimeMessages(t_s, counters[2][s], t_beacon_ns[s] // 1000, run.clock.read(t_beacon_ns)[s] // 1_000_000),
         heartbeats=Heartbeats(t_h, counters[3][h]),
         wheels=_wheel_frames(run),
+        barometer=PressureMessages(t_p, counters[4][p], run.clock.read(t_pressure_ns)[p] // 1_000_000, pressures[p]),
         chatter=(*(_chatter(run) if scenario.wheels.chatter else ()), *_traffic(run)),
         telemetry=tuple(
             _received(run, message, sent, counter)

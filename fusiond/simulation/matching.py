@@ -8,9 +8,9 @@ import numpy as np
 
 from fusiond.earth import Array
 from fusiond.simulation import wheels
-from fusiond.simulation.scenario import WHEELS, Gnss, Imu, Scenario
+from fusiond.simulation.scenario import WHEELS, Barometer, Gnss, Imu, Scenario
 from fusiond.simulation.trajectory import euler_matrix
-from fusiond.simulation.wire import BUS, GNSS, IMU, LINK
+from fusiond.simulation.wire import BAROMETER, BUS, GNSS, IMU, LINK
 
 LEAST_NOISE = 1e-5  # a noiseless sensor still needs a sigma
 OWN_SCALE_SPEED = 10.0  # m/s, at which a wheel's own scale error is counted as noise
@@ -43,7 +43,8 @@ def _dbc_start(bit: int) -> int:
 def configuration(scenario: Scenario, dbc_name: str) -> str:
     """The text of a fusiond configuration that fits the drive: an installer's measurements and data-sheet noise, and
     nothing of the drawn errors (biases, mount, wheel scale) that the filter has to find."""
-    return "\n".join([_head(scenario, dbc_name), _imu(scenario.imu), _gnss(scenario), *_wheels(scenario)]) + "\n"
+    tables = [_head(scenario, dbc_name), _imu(scenario.imu), _gnss(scenario), *_wheels(scenario)]
+    return "\n".join(tables + ([_barometer(scenario.barometer)] if scenario.barometer.rate_hz else [])) + "\n"
 
 
 def _from_imu(scenario: Scenario, point_m: Array) -> str:
@@ -97,6 +98,16 @@ gyro_bias_walk = {imu.gyro_bias_walk:.3g}  # [rad/s/sqrt(s)]
 
 def _sigma(given: tuple[float, float, float] | None, sigma: float) -> float:
     return sigma if given is None else max(sigma, *(abs(value) for value in given))
+
+
+def _barometer(barometer: Barometer) -> str:
+    return f"""\
+[barometer.{BAROMETER}]
+link = "{LINK}"
+sigma_m = {max(barometer.sigma_m, LEAST_NOISE):.3g}  # noise of one reading, as a height
+correlation_s = 0.0  # time over which its errors stay alike
+offset_walk_m = {barometer.offset_walk_m:.3g}  # random walk of what it reads too much [m/sqrt(s)]
+"""
 
 
 def _gnss(scenario: Scenario) -> str:

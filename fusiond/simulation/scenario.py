@@ -187,6 +187,16 @@ class Wheels(Section, frozen=True, kw_only=True):
     transport: Transport = field(default_factory=lambda: Transport(latency_ms=0.2, jitter_ms=0.3))
 
 
+class Barometer(Section, frozen=True, kw_only=True):
+    """[barometer]: SCALED_PRESSURE, at the IMU."""
+
+    rate_hz: Annotated[float, Meta(ge=0, le=100)] = 0.0  # readings a second; 0: there is none
+    sigma_m: NotNegative = 0.3  # white, as a height
+    offset_m: float = 60.0  # pressure altitude less height above the ellipsoid, at the start
+    offset_walk_m: NotNegative = 0.02  # its random walk [m/sqrt(s)]
+    transport: Transport = field(default_factory=Transport)
+
+
 class Scenario(Section, frozen=True, kw_only=True):
     """The whole file."""
 
@@ -200,6 +210,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     imu: Imu = field(default_factory=Imu)
     gnss: Gnss = field(default_factory=Gnss)
     wheels: Wheels = field(default_factory=Wheels)
+    barometer: Barometer = field(default_factory=Barometer)
 
     @property
     def duration_s(self) -> float:

@@ -19,15 +19,17 @@ from fusiond.measurements import (
     GnssVelocity,
     ImuSample,
     Invalid,
+    Pressure,
     Received,
     WheelSpeed,
     boot_clock,
 )
+from fusiond.simulation.barometer import CENTI_CELSIUS
 from fusiond.simulation.gnss import FIX_3D, Fixes
 from fusiond.simulation.scenario import WHEELS
 from fusiond.simulation.transport import Mask, Stamps
 
-LINK, BUS, IMU, GNSS, SYSTEM = "fcu", "car", "imu0", "gps0", 1  # the names in the matching configuration
+LINK, BUS, IMU, GNSS, BAROMETER, SYSTEM = "fcu", "car", "imu0", "gps0", "baro0", 1  # the names in the matching configuration
 BOOT_CLOCK = boot_clock(LINK, SYSTEM)
 UNIX_FROM_US = 10**15  # a `time_usec` beyond this is Unix time
 
@@ -86,6 +88,22 @@ class GnssMessages:
     def _velocity(self, vel: int, cog: int) -> GnssVelocity:
         speed, course = vel / 1e2, math.radians(cog / 1e2)
         return GnssVelocity(speed * math.cos(course), speed * math.sin(course), None, self.fixes.vel_acc / 1e3 or None)
+
+
+@dataclass(frozen=True, slots=True)
+class PressureMessages:
+    """SCALED_PRESSURE."""
+
+    t_receive_us: Stamps
+    counter: Stamps
+    boot_ms: Stamps
+    hectopascal: NDArray[np.float32]
+
+    def events(self) -> Iterator[Received]:
+        columns = (self.t_receive_us, self.boot_ms, self.hectopascal)
+        for sequence, (t_us, boot_ms, hectopascal) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+            payload = Pressure(hectopascal * 100.0, CENTI_CELSIUS / 100 + 273.15)
+            yield Received(BAROMETER, sequence, BOOT_CLOCK, boot_ms * 10**6, t_us * 1000, payload)
 
 
 @dataclass(frozen=True, slots=True)

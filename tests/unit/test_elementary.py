@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.elementary import HALF_PI_HIGH, HALF_PI_LOW, asin, atan2, exp, sin_cos, square
+from fusiond.elementary import HALF_PI_HIGH, HALF_PI_LOW, asin, atan2, exp, log, sin_cos, square
 
 CASES = 20_000
 
@@ -66,6 +66,22 @@ def test_exponential_of_special_values() -> None:
     assert (exp(0.0), exp(-701.0), exp(-math.inf)) == (1.0, 0.0, 0.0)
     assert exp(701.0) == exp(math.inf) == math.inf
     assert math.isnan(exp(math.nan))
+
+
+@pytest.mark.parametrize("decades", [1e-12, 1e-3, 1.0, 300.0])
+def test_logarithm(decades: float) -> None:
+    for power in np.random.default_rng(6).uniform(-decades, decades, CASES).tolist():
+        x = 10.0**power
+        assert ulps(log(x), math.log(x)) <= 2
+
+
+def test_logarithm_of_special_values() -> None:
+    assert (log(1.0), log(math.inf), log(0.0), log(-0.0)) == (0.0, math.inf, -math.inf, -math.inf)
+    assert log(5e-324) == pytest.approx(math.log(5e-324), rel=1e-15)
+    assert log(2.0**40) == pytest.approx(40 * math.log(2.0), rel=1e-15)
+    assert math.isnan(log(-1.0))
+    assert math.isnan(log(math.nan))
+    assert math.isnan(log(-math.inf))
 
 
 def test_square_is_rounded_once() -> None:
