@@ -1,4 +1,4 @@
-"""The command line: run, top, replay, check, simulate, demo."""
+"""The command line: run, top, replay, check, mount, simulate, demo."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from fusiond import __version__, config, demo, report
+from fusiond import __version__, config, demo, mounting, report
+from fusiond.clock import Clock
 from fusiond.comparison import TruthError, Window
 from fusiond.describe import description, oddities
+from fusiond.mounting import MountingError
+from fusiond.progress import shown
 from fusiond.replay import Options, OutputError, UsageError, parse_interval, parse_withheld, replay
 from fusiond.sections import Config
 from fusiond.simulation import scenario
@@ -21,6 +24,7 @@ from fusiond.toml_file import ConfigError
 from fusiond_adapters import journal
 from fusiond_adapters.can import CanDecoder
 from fusiond_adapters.logs import LogError
+from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
 from fusiond_adapters.mavlink import MavlinkDecoder
 
@@ -37,6 +41,10 @@ latest events, as published over Zenoh. Yellow: look at it; red: out of order. q
 REPLAY = """\
 Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
 belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
+MOUNT = """\
+Find how the IMU is turned against forward-right-down, from the logs of a drive, and print the rotation_deg to configure:
+any rotation, upside down included. Run again with that configured, it tells what is left. The drive needs a minute or
+more, mostly forward, with pulling away, braking, and bends both ways. The configuration is not changed."""
 REPLAY_EXAMPLES = """\
 examples:
   fusiond replay --config car.toml drive.tlog drive.log --csv track.csv
@@ -77,6 +85,11 @@ def parser() -> argparse.ArgumentParser:
     check.epilog = "example:\n  fusiond check --config car.toml"
     check.add_argument("--config", metavar="C.toml", required=True, help="configuration file")
     check.set_defaults(run=run_check)
+    mount = _add(commands, "mount", "find how the IMU is turned in the vehicle, from logs")
+    mount.description, mount.epilog = MOUNT, "example:\n  fusiond mount --config car.toml drive.tlog drive.log"
+    mount.add_argument("logs", metavar="LOG", nargs="+", help="as for replay")
+    mount.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
+    mount.set_defaults(run=run_mount)
     simulate = _add(commands, "simulate", "write the logs of a simulated drive, and the truth about it")
     simulate.epilog = "example:\n  fusiond simulate --config configs/simulate-demo.toml --out drive"
     simulate.add_argument("--config", metavar="S.toml", required=True, help="scenario file")
@@ -107,6 +120,7 @@ def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
     add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
     add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
+    add("--stored", metavar="STATE.json", type=Path, help="begin with the stored state that the recorded run began with")
     add("--mcap", metavar="OUT.mcap", type=Path, help="write everything published, for Foxglove (extra `mcap`)")
     add("--plot", metavar="OUT.png", type=Path, help="draw the track and, with --truth, its errors (extra `plot`)")
     add(
@@ -187,6 +201,7 @@ def run_replay(arguments: argparse.Namespace) -> None:
         truth=arguments.truth,
         plot=arguments.plot,
         mcap=arguments.mcap,
+        stored=arguments.stored,
         withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
         window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
         rate_hz=arguments.rate,
@@ -210,6 +225,19 @@ def run_check(arguments: argparse.Namespace) -> None:
     print(f"{arguments.config}: can be used" + (f", with {len(odd)} warning(s)" if odd else ""))
 
 
+def run_mount(arguments: argparse.Namespace) -> None:
+    """fusiond mount"""
+    loaded = config.load(arguments.config)
+    ((source, imu),) = loaded.imu.items()
+    logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), mounting.Gathering(loaded)
+    progress = shown(logs, lambda: logs.bytes_read / logs.bytes_total, lambda: gathering.elapsed_ns, sys.stderr)
+    for received in progress:
+        measurement = clock.align(received)
+        if measurement is not None:
+            gathering.add(measurement)
+    print(mounting.text(mounting.find(gathering.windows(), imu.rotation_deg), source))
+
+
 def run_simulate(arguments: argparse.Namespace) -> None:
     """fusiond simulate"""
     for path in write_drive(scenario.load(arguments.config), arguments.out, arguments.seed):
@@ -230,7 +258,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except (ConfigError, UsageError) as error:
         return _failed(str(error), USAGE)
-    except (LogError, TruthError, OutputError) as error:
+    except (LogError, TruthError, OutputError, MountingError) as error:
         return _failed(str(error), UNUSABLE)
     except BrokenPipeError:  # whoever read our output has gone; keep the interpreter from flushing into it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

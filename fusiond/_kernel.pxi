@@ -119,6 +119,7 @@ cdef enum:
     FUSED = 0
     REJECTED = 1
     DUPLICATE = 3
+    WAITING = 5
     IMU = -1
     GNSS_POSITION = 0
     GNSS_VELOCITY = 1
@@ -170,6 +171,8 @@ PRIOR[:] = health.PRIOR
 cdef double OUTLIERS = health.OUTLIERS
 cdef double LEAST_WEIGHT = bank.LEAST_WEIGHT
 cdef double BANK_CLUTTER = bank.CLUTTER
+cdef double BANK_FAR = bank.FAR
+cdef double BANK_DOUBT = bank.DOUBT
 cdef double OUTLIER_VARIANCE = health.OUTLIER_VARIANCE
 cdef double NOISY_VARIANCE = health.NOISY_VARIANCE
 cdef double FIRST_BIAS_VARIANCE = health.FIRST_BIAS_VARIANCE
@@ -221,7 +224,8 @@ def check_layout():
         ("CLUTTER", CLUTTER), ("PARAMETERS", PARAMETERS), ("VALUES", VALUES),
     ):
         assert getattr(observe.model, name) == number, name
-    assert (Outcome.FUSED, Outcome.REJECTED, Outcome.DUPLICATE) == (FUSED, REJECTED, DUPLICATE)
+    assert (Outcome.FUSED, Outcome.REJECTED) == (FUSED, REJECTED)
+    assert (Outcome.DUPLICATE, Outcome.WAITING) == (DUPLICATE, WAITING)
 
 
 # ---------------------------------------------------------------- elementary functions (fusiond.elementary)
@@ -1271,7 +1275,7 @@ cdef class Kernel:
                     break
                 if row.source == source:
                     if row.sequence == sequence:
-                        return -1
+                        return ~(i - 1 - begin)
                     if row.sequence < sequence:
                         break
             i -= 1
@@ -1304,40 +1308,24 @@ cdef class Kernel:
             i += 1
         return i - begin
 
-    def offer(self, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, Py_ssize_t kept, int64_t limit_ns, int64_t t_ns,
-              int32_t source, int64_t sequence, int64_t t_receive_ns, int32_t waiting, tuple values):
+    def offer(self, Py_ssize_t begin, Py_ssize_t end, int64_t t_ns, int32_t source, int64_t sequence,
+              int64_t t_receive_ns, tuple values):
         """fusiond.kernel.Kernel.offer"""
-        cdef Py_ssize_t place = self.place(begin, end, t_ns, source, sequence), first_changed, rerun = 0
-        cdef bint done
+        cdef Py_ssize_t place = self.place(begin, end, t_ns, source, sequence)
         if place < 0:
-            return place, applied, kept, 0, True
-        self.insert(begin + place, end, t_ns, source, sequence, t_receive_ns, waiting, values)
-        first_changed = self.first_changed(begin, place)
-        if place < applied:
-            applied += 1
-        if first_changed < applied:
-            kept = self.restore(kept, first_changed)
-            rerun = applied - self.kept_applied[kept - 1]
-            applied -= rerun
-        done = self.go(begin, end + 1, &applied, limit_ns, &kept)
-        return place, applied, kept, rerun, done
+            return place
+        self.insert(begin + place, end, t_ns, source, sequence, t_receive_ns, WAITING, values)
+        return self.first_changed(begin, place)
 
-    def outcome(self, Py_ssize_t at):
-        """fusiond.kernel.Kernel.outcome"""
-        return self.table[at].outcome
-
-    cpdef Py_ssize_t restore(self, Py_ssize_t kept, Py_ssize_t first_changed):
+    def restore(self, Py_ssize_t kept):
         """fusiond.kernel.Kernel.restore"""
         cdef size_t bank_bytes = HYPOTHESES * BLOCK * sizeof(double)
-        while self.kept_applied[kept - 1] > first_changed:
-            kept -= 1
         memcpy(&self.head_numbers[0], &self.kept_numbers[kept - 1, 0], self.core_size * sizeof(double))
         if self.kept_whole[kept - 1, PHASE] == CHOOSING:
             memcpy(&self.head_numbers[self.core_size], &self.kept_numbers[kept - 1, self.core_size], bank_bytes)
         elif self.head_whole[PHASE] == CHOOSING:
             memset(&self.head_numbers[self.core_size], 0, bank_bytes)
         memcpy(&self.head_whole[0], &self.kept_whole[kept - 1, 0], self.head_whole.shape[0] * sizeof(int64_t))
-        return kept
 
     def run(self, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t applied, int64_t limit_ns, Py_ssize_t kept):
         """fusiond.kernel.Kernel.run"""
@@ -1788,7 +1776,7 @@ cdef class Kernel:
         cdef double turns[HYPOTHESES]
         cdef double to_n[9]
         cdef double turned[3]
-        cdef double mean = 0.0, spread = 0.0, own
+        cdef double mean = 0.0, spread = 0.0, doubt = 0.0, own
         cdef double* down = to_n + 6
         cdef double* best
         cdef double* p
@@ -1815,7 +1803,9 @@ cdef class Kernel:
                                  + p[(ATTITUDE + a) * n + ATTITUDE + 2] * down[2])
                 own = down[0] * turned[0] + down[1] * turned[1] + down[2] * turned[2]
                 spread += self.bank[i * BLOCK] * (own + (turns[i] - mean) * (turns[i] - mean))
-        if spread <= self.heading_variance:
+                if fabs(turns[i]) > BANK_FAR:
+                    doubt += self.bank[i * BLOCK]
+        if spread <= self.heading_variance and doubt <= BANK_DOUBT:
             self.collapse(best, errors)
 
     cdef void collapse(self, double* best, double errors[HYPOTHESES][n]) noexcept nogil:

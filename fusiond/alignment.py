@@ -2,7 +2,8 @@
 
 While aligning, the state only gathers: means of the inertial samples (`motion.watch`), the last fix, the velocity at the
 begin of a window. It starts at the first event at which position, level and heading are known. In motion, the vehicle's
-own acceleration, as the change of GNSS velocity tells it, is taken out of the accelerometer before leveling.
+own acceleration, as the change of GNSS velocity tells it, is taken out of the accelerometer before leveling. What an
+earlier run has stored is judged in `fusiond.hot_start`.
 """
 
 from __future__ import annotations
@@ -11,21 +12,21 @@ import math
 
 import numpy as np
 
+from fusiond import hot_start
 from fusiond.earth import Array, geodetic_trig, mat_ne, mat_ne_from_trig
 from fusiond.elementary import atan2, sin_cos, square
 from fusiond.health import arrive
-from fusiond.motion import MEAN_FILLED, ZERO_VELOCITY, watch
+from fusiond.motion import MEAN_FILLED, MEAN_TIME, ZERO_VELOCITY, watch
 from fusiond.observe import gnss_position, gnss_velocity, wheel_speed, zero_velocity
 from fusiond.observe.model import LEVER_ARM_B
 from fusiond.plan import IMU, MODEL, SECOND, Plan
 from fusiond.rotation import matrix, matrix_from_euler, product, quaternion
 from fusiond.state import (
-    ACCEL_BIAS,
+    ACCEL_BIAS_B,
     ALIGNING,
     ANTENNA_B,
     ANTENNA_ERROR,
     ATTITUDE,
-    CALIBRATIONS,
     CHOOSING,
     DELAYS,
     DELAYS_ERROR,
@@ -49,6 +50,7 @@ from fusiond.state import (
     RATE_B,
     REST_RATE_B,
     RUNNING,
+    STORED,
     T_CONSTRAINT,
     T_FIRST_VELOCITY,
     T_FIX,
@@ -63,6 +65,7 @@ from fusiond.state import (
     FilterState,
     T,
 )
+from fusiond.stored import StoredState
 
 FIX_FRESH_NS = 2 * SECOND  # a fix older than this does not start the filter
 WINDOW_LEAST_NS = SECOND  # the GNSS velocities that tell the vehicle's acceleration lie at least so far apart
@@ -112,11 +115,10 @@ def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan
 
 def _start_by_position(state: FilterState, source: int, plan: Plan) -> None:
     """Start at rest; or, where no GNSS velocity is to be had, in a motion that only its bound is known of."""
-    stamps, speed = state.stamps, _gnss_speed(state)
+    speed = _gnss_speed(state)
     if not _leveled(state) or speed >= plan.filter.course_speed_mps:
         return
-    rest = stamps[T_STILL] != NEVER and (plan.wheels or not math.isnan(speed))
-    if rest:
+    if _rests(state, plan):
         _start(state, source, None, plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, plan)
     elif plan.filter.heading_deg is not None or not plan.velocities:
         _start(state, source, None, square(plan.filter.v_max_mps / 3), None, plan)
@@ -152,6 +154,11 @@ def _gnss_speed(state: FilterState) -> float:
     return math.sqrt(square(north) + square(east))
 
 
+def _rests(state: FilterState, plan: Plan) -> bool:
+    """Whether more than a quiet inertial sensor says that the vehicle stands."""
+    return bool(state.stamps[T_STILL] != NEVER) and (bool(plan.wheels) or not math.isnan(_gnss_speed(state)))
+
+
 def _leveled(state: FilterState) -> bool:
     return bool(state.auxiliary[MEAN_WEIGHT] >= MEAN_FILLED)
 
@@ -166,21 +173,58 @@ def _start(
 ) -> None:
     """Start from what was gathered: with a velocity (3,) [m/s], or None where it was not measured, and its variance; with
     a heading and sigma [rad], a given one before a measured one; and where there is none, with a bank of hypotheses all
-    round."""
+    round, and a stored one among them."""
     if plan.filter.heading_deg is not None:
         heading = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
+    stored, verdict = hot_start.recall(state, plan)
+    first = _first_variances(state, stored, plan)
     if heading is not None:
-        _place(state, source, measured_n, variance, heading, plan)
+        _place(state, source, measured_n, variance, heading, first, plan)
         state.stamps[PHASE] = RUNNING
     else:
+        kept = None
+        if stored is not None:
+            level = _level(state, None, 0.0) if measured_n is None and _rests(state, plan) else None
+            kept, verdict = hot_start.heading(stored, state, source, level, plan)
         state.bank[:] = 0.0
-        for i in range(ALL_ROUND):
-            turned = 2 * math.pi * i / ALL_ROUND, BANK_SIGMA
-            state.bank[i, 0] = 1 / ALL_ROUND
+        headings = [(2 * math.pi * i / ALL_ROUND, BANK_SIGMA) for i in range(ALL_ROUND)]
+        state.bank[:ALL_ROUND, 0] = (1.0 - (kept.weight if kept else 0.0)) / ALL_ROUND
+        if kept:
+            headings.append((kept.yaw, kept.sigma))
+            state.bank[STORED, 0] = kept.weight
+        for i, turned in enumerate(headings):
             state.hypothesis(i).nominal[:] = state.nominal  # biases and calibrations of before
-            _place(state.hypothesis(i), source, measured_n, variance, turned, plan)
+            _place(state.hypothesis(i), source, measured_n, variance, turned, first, plan)
         state.stamps[PHASE] = CHOOSING
+    if verdict:
+        state.memory[plan.imu_source, LAST_VALUE] = verdict
     state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
+
+
+def _first_variances(state: FilterState, stored: StoredState | None, plan: Plan) -> Array:
+    """Put the first biases and calibrations into the state: stored ones, and the gyro bias of a standstill where that is
+    better. Returns the variances (n - 9,) of the error states from the gyro bias on."""
+    stamps, x = state.stamps, state.nominal
+    rest = stamps[T_REST] != NEVER and stamps[T] - stamps[T_REST] <= REST_FRESH_NS
+    gyro = square(min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma)
+    variances = [gyro] * 3 + [square(plan.imu.accel_bias_sigma)] * 3 + plan.calibration_variances.tolist()
+    measured = state.auxiliary[REST_RATE_B].copy() if rest else x[GYRO_BIAS_B].copy()
+    if stored is not None:
+        x[GYRO_BIAS_B.start : state.size + 1], variances = hot_start.aged(stored, state, plan)
+    trusted = stored is not None and not _contradicted(state, variances, plan)
+    for a in range(3):
+        if not trusted or variances[a] > gyro:
+            x[GYRO_BIAS_B.start + a], variances[a] = measured[a], gyro
+    return np.array(variances)
+
+
+def _contradicted(state: FilterState, variances: list[float], plan: Plan) -> bool:
+    """Whether the gyro at rest reads something else than the bias in the state, whose variances come first."""
+    if state.stamps[T_STILL] == NEVER:
+        return False
+    noise = square(REST_BIAS_SIGMA) + plan.noise.gyro / MEAN_TIME
+    off = state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
+    return any(square(off[a]) > 9 * (variances[a] + noise) for a in range(3))
 
 
 def _place(
@@ -189,9 +233,10 @@ def _place(
     measured_n: Array | None,
     variance: float,
     heading: tuple[float, float],
+    first: Array,
     plan: Plan,
 ) -> None:
-    """Make the first state of one heading."""
+    """Make the first state of one heading; `first` are the variances of the error states from the gyro bias on."""
     stamps, auxiliary, x = state.stamps, state.auxiliary, state.nominal
     yaw, yaw_sigma = heading
     to_n = mat_ne_from_trig(*geodetic_trig(*(float(c) for c in auxiliary[FIX_E])))
@@ -202,9 +247,6 @@ def _place(
     x[POSITION_E] = auxiliary[FIX_E] + product(to_n.T, velocity_n * since - product(mat_nb, lever_b))
     x[VELOCITY_E] = product(to_n.T, velocity_n)
     x[QUATERNION_EB] = quaternion(product(to_n.T, mat_nb))
-    rest = stamps[T_REST] != NEVER and stamps[T] - stamps[T_REST] <= REST_FRESH_NS
-    if rest:
-        x[GYRO_BIAS_B] = auxiliary[REST_RATE_B]
     horizontal, vertical = auxiliary[FIX_VARIANCE]
     level = square(math.radians(plan.filter.level_sigma_deg))
     covariance = state.covariance
@@ -213,14 +255,8 @@ def _place(
     covariance[POSITION, POSITION] = product(to_n.T * [horizontal + aged, horizontal + aged, vertical + aged], to_n)
     covariance[VELOCITY, VELOCITY] = np.eye(3) * variance
     covariance[ATTITUDE, ATTITUDE] = product(to_n.T * [level, level, square(yaw_sigma)], to_n)
-    for block, sigma in (
-        (GYRO_BIAS, min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma),
-        (ACCEL_BIAS, plan.imu.accel_bias_sigma),
-    ):
-        for i in range(block.start, block.stop):
-            covariance[i, i] = square(sigma)
-    for i, first in enumerate(plan.calibration_variances, CALIBRATIONS):
-        covariance[i, i] = first
+    for i, own in enumerate(first, GYRO_BIAS.start):
+        covariance[i, i] = own
     if state.size == WIDE_SIZE:
         _tie(state, _gain(state, measured_n))
 
@@ -255,7 +291,7 @@ def _gain(state: FilterState, velocity_n: Array | None) -> Array:
 
 def _level(state: FilterState, velocity_n: Array | None, yaw: float) -> tuple[float, float]:
     """Roll and pitch [rad] at which the mean specific force is gravity's reaction and the vehicle's own acceleration."""
-    force = state.auxiliary[MEAN_FORCE_B].copy()
+    force = state.auxiliary[MEAN_FORCE_B] - state.nominal[ACCEL_BIAS_B]
     north, east, _ = _gain(state, velocity_n)
     sine, cosine = sin_cos(yaw)
     force[0] -= cosine * north + sine * east

@@ -345,20 +345,19 @@ class Clock:
         if isinstance(payload, ClockPair):
             self._learn(received, payload)
             return None
-        source, clock, receive, stamp = received.source, received.clock, received.t_receive_ns, received.t_sensor_ns
-        placed: int | str = receive
-        if stamp is None or not clock:
+        source, receive, stamp = received.source, received.t_receive_ns, received.t_sensor_ns
+        t_ns = receive
+        if stamp is None or not received.clock:
             self._arrivals += 1
-        elif stamp <= 0:
-            placed = ABSURD
         elif isinstance(payload, Invalid):
-            placed = self._aligner(clock).peek(stamp, receive)
+            t_ns = self._aligner(received.clock).peek(stamp, receive) if stamp > 0 else receive
         else:
-            placed = self._aligner(clock).place(source, stamp, receive)
-        if isinstance(placed, str):
-            payload = payload if isinstance(payload, Invalid) else Invalid(placed)
-            placed = receive
-        return Measurement(placed - self._delays.get(source, 0), source, received.sequence, receive, payload)
+            placed = self._aligner(received.clock).place(source, stamp, receive) if stamp > 0 else ABSURD
+            if isinstance(placed, int):
+                t_ns = placed
+            else:
+                payload = Invalid(placed)
+        return Measurement(t_ns - self._delays.get(source, 0), source, received.sequence, receive, payload)
 
     def report(self) -> dict[str, ClockReport]:
         """How each clock is aligned, by name; "arrival" stands for what came without a stamp."""

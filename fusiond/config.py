@@ -106,13 +106,15 @@ def _contradictions_on_ros2(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _contradictions_of_learning(config: Config) -> Iterator[tuple[str, str]]:
-    for table, named in (("gnss", config.gnss), ("wheel", config.wheel)):
+    for table, named in (("gnss", config.gnss), ("wheel", config.wheel), ("barometer", config.barometer)):
         for name, source in named.items():
             if source.noise_least > source.noise_most:
                 yield f"{table}.{name}.noise_least", f"must not exceed noise_most ({source.noise_most:g})"
     learnt = [name for name, gnss in config.gnss.items() if calibrated(gnss)]
     if len(learnt) > 1:
         yield f"gnss.{learnt[1]}", f"the lever arm and delays of one receiver can be learnt: [gnss.{learnt[0]}]"
+    for name in list(config.barometer)[1:]:
+        yield f"barometer.{name}", f"there is one height offset to learn, that of [barometer.{next(iter(config.barometer))}]"
     if len(set(wheel_groups(config).values())) > MOST_SCALES:
         yield "filter.wheel_scale_by", f"at most {MOST_SCALES} scales, '{config.filter.wheel_scale_by}' makes more"
 

@@ -23,6 +23,7 @@ from fusiond.messages import EventMessage, HealthMessage, InputHealth, LatencyHe
 from fusiond.publication import Surroundings, config_message, info_message
 from fusiond.reload import changes
 from fusiond.sections import Config
+from fusiond.stored import to_text
 from fusiond.toml_file import ConfigError
 from fusiond_adapters import journal
 from fusiond_adapters.can_bus import CanBus
@@ -32,6 +33,7 @@ from fusiond_adapters.logs.record import Recorder
 from fusiond_adapters.mavlink_link import MavlinkLink
 from fusiond_adapters.outputs import Around, LiveOutput, OutputLost
 from fusiond_adapters.outputs_table import make_outputs
+from fusiond_adapters.state_file import StateFile
 from fusiond_adapters.systemd import Notifier, watchdog_s
 
 SECOND = 1_000_000_000  # ns
@@ -70,7 +72,11 @@ class Daemon:
     ) -> None:
         self.config = config
         self.clock = clock or HostClock()
-        self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._surroundings)
+        self._state_file, stored = None, None
+        if config.state.file is not None:
+            self._state_file = StateFile(config.path(config.state.file), config, self.clock.now_ns())
+            stored = self._state_file.stored
+        self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._surroundings, stored=stored)
         self.inputs = self._make_inputs(config)
         self.outputs = make_outputs(config, Around(self.clock, self.inputs)) | {one.name: one for one in outputs}
         if not zenoh:
@@ -104,7 +110,9 @@ class Daemon:
         """Run until asked to stop. Raises OSError where the black box's folder cannot be made."""
         self._loop = asyncio.get_running_loop()
         self._open_recorder()
-        workers = len(self.inputs) + len(self.outputs) + 1
+        if self._recorder and self._state_file and self._state_file.stored:
+            self._recorder.add("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
+        workers = len(self.inputs) + len(self.outputs) + 2
         executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="fusiond")
         try:
             async with asyncio.TaskGroup() as group:
@@ -118,6 +126,8 @@ class Daemon:
                 for name, output in self.outputs.items():
                     group.create_task(self._keep(output, executor, tried[name]), name=output.about)
                 group.create_task(self._come_up(tried.values()))
+                if self._state_file:
+                    group.create_task(self._keep_state(self._state_file, executor), name="state file")
         finally:
             for event in self._stops.values():
                 event.set()
@@ -217,6 +227,18 @@ class Daemon:
             return IDLE_S
         return min(IDLE_S, max(0.0, (due - self.clock.now_ns()) / SECOND / self.clock.speed))
 
+    # --- The stored state
+
+    async def _keep_state(self, file: StateFile, executor: ThreadPoolExecutor) -> None:
+        """Store the newest state again and again, and at the end, in a thread: a disk may be slow."""
+        over = False
+        while not over:
+            await _first(self._outputs_over, self.config.state.every_s)
+            over = self._outputs_over.is_set()
+            newest = self.live.engine.fusion.to_store()
+            if newest is not None:
+                await asyncio.get_running_loop().run_in_executor(executor, file.write, newest)
+
     # --- Outputs
 
     def _publish(self, message: Message) -> None:
@@ -296,6 +318,8 @@ class Daemon:
         if box := self._recorder:
             notes = {"error": box.error} if box.error else {}
             outputs["record"] = OutputHealth(offered=box.written + box.lost, dropped=box.lost, counts={}, notes=notes)
+        if file := self._state_file:
+            outputs["state"] = file.health(self.live.engine.fusion.hot_start())
         latency = LatencyHealth(fused=self.live.to_fusion.report(), published=self.live.to_publication.report())
         return Surroundings(latency, inputs, outputs)
 
@@ -305,6 +329,7 @@ class Daemon:
         found |= {f"{key} frames lost before receipt": source.inbox.missed for key, source in self.inputs.items()}
         found |= {f"{name} messages dropped": output.outbox.dropped for name, output in self.outputs.items()}
         found["stamps moved"] = self.live.moved
+        found["states not stored"] = self._state_file.lost if self._state_file else 0
         return found | {"records lost": self._recorder.lost if self._recorder else 0}
 
     def _report_losses(self) -> None:
@@ -313,8 +338,9 @@ class Daemon:
         new = {name: count - self._told.get(name, 0) for name, count in losses.items() if name != "stamps moved"}
         told = ", ".join(f"{count} {name}" for name, count in new.items() if count)
         if told:
-            box = f"; black box: {self._recorder.error}" if self._recorder and self._recorder.error else ""
-            log.warning("in the last %g s: %s%s", REPORT_S, told, box, extra={"MESSAGE_ID": journal.DATA_LOST})
+            disks = (("black box", self._recorder), ("state file", self._state_file))
+            why = "".join(f"; {name}: {disk.error}" for name, disk in disks if disk and disk.error)
+            log.warning("in the last %g s: %s%s", REPORT_S, told, why, extra={"MESSAGE_ID": journal.DATA_LOST})
         self._told = losses
 
     def reload(self) -> None:

@@ -29,6 +29,7 @@ def description(config: Config) -> Iterator[str]:
         yield from _wheel(name, wheel)
     for name, barometer in config.barometer.items():
         yield f"barometer    {name}: {barometer.message} of {barometer.link}, {_delay(barometer.delay_ms)}"
+        yield f"             sigma {barometer.sigma_m:g} m about a height offset that is learnt"
     constraints = [
         f"no sideways speed at {_place(motion.point_m)} above {motion.minimum_speed_mps:g} m/s" * motion.non_holonomic,
         f"zero velocity and rotation after {motion.still_after_s:g} s at rest" * motion.standstill,

@@ -15,6 +15,7 @@ from fusiond.kernel import Outcome
 from fusiond.measurements import Received
 from fusiond.messages import OutcomeCounts, StateMessage, state_message
 from fusiond.sections import Config
+from fusiond.stored import StoredState
 
 SECOND = 1_000_000_000  # ns
 LONGEST_SILENCE_NS = 60 * SECOND  # ticks go on for so long after an event; a longer hole is passed over
@@ -28,7 +29,8 @@ OnTick = Callable[[int, StateMessage], None]  # time since the first event [ns],
 class Engine:
     """The fusion of one vehicle and its ticks; without `on_tick` there are none.
 
-    `before_tick` is called with the time of a tick [ns from the first event] before it is made, and may sleep.
+    `before_tick` is called with the time of a tick [ns from the first event] before it is made, and may sleep. `stored` is
+    for a hot start; StoredStateError where it is not for this configuration.
     """
 
     def __init__(
@@ -37,8 +39,9 @@ class Engine:
         rate_hz: float,
         on_tick: OnTick | None,
         before_tick: Callable[[int], None] | None = None,
+        stored: StoredState | None = None,
     ) -> None:
-        self.fusion = Fusion(config)
+        self.fusion = Fusion(config, stored=stored)
         self.first_ns: int | None = None  # receipt of the first event
         self.now_ns = 0  # latest receipt so far
         self.rows = self.skipped = 0  # ticks made, and passed over in long silences

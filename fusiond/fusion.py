@@ -15,6 +15,7 @@ from fusiond.earth import Array, geodetic, mat_ne
 from fusiond.estimate import Estimate, Mode, StateEstimate
 from fusiond.health import Belief, belief
 from fusiond.history import History
+from fusiond.hot_start import Verdict, decided, leading, leads
 from fusiond.kernel import Outcome
 from fusiond.measurements import ImuSample, Invalid, Measurement, Received
 from fusiond.observe import MODELS
@@ -29,6 +30,7 @@ from fusiond.state import (
     FORCE_B,
     GYRO_BIAS,
     GYRO_BIAS_B,
+    LAST_VALUE,
     MOUNT,
     MOUNT_ERROR,
     NEVER,
@@ -49,6 +51,7 @@ from fusiond.state import (
     FilterState,
     T,
 )
+from fusiond.stored import StoredState, check, stored_state
 
 LOST_IMU_NS = 5 * SECOND  # without an inertial sample for so long the state is called lost
 
@@ -57,20 +60,29 @@ class Receipt(Struct, frozen=True, gc=False):
     """What became of an event that was received."""
 
     measurement: Measurement
-    outcome: Outcome
+    history: History
+    refusal: Outcome | None = None  # INVALID, TOO_OLD or DUPLICATE; None where it stands in the history
     reason: str = ""  # of INVALID
+
+    @property
+    def outcome(self) -> Outcome:
+        """By now: what stands in the history is judged again when another event comes before it. Asking has the history
+        judge it; LookupError where it is forgotten there, long after the horizon."""
+        return self.history.outcome(self.measurement) if self.refusal is None else self.refusal
 
 
 class Fusion:
     """Clock, history and filter of one vehicle, by its configuration."""
 
-    def __init__(self, config: Config, compiled: bool | None = None) -> None:
-        """`compiled` asks for the compiled kernel or its NumPy twin; by default the compiled one where it was built."""
+    def __init__(self, config: Config, compiled: bool | None = None, stored: StoredState | None = None) -> None:
+        """`compiled` asks for the compiled kernel or its NumPy twin; by default the compiled one where it was built.
+        `stored` is what an earlier run left for a hot start; StoredStateError where it is not for this configuration."""
+        if stored is not None:
+            check(stored, config)
         self.config = config
-        self.plan = plan(config)
+        self.plan = plan(config, stored)
         self.clock = Clock(config)
         self.history = History(self.plan, compiled)
-        self._unmodelled = frozenset(config.barometer) - frozenset(self.plan.sources)
         self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
             source: (imu_values if model == IMU else MODELS[model].values, section_of(source, model, config))
             for source, model in zip(self.plan.sources, self.plan.models, strict=True)
@@ -78,40 +90,48 @@ class Fusion:
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 
     def receive(self, received: Received) -> Receipt | None:
-        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only: pairs
-        of clocks, and sources that no observation model takes.
+        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only.
 
         The source must be one of the configuration's; ValueError otherwise.
         """
         measurement = self.clock.align(received)
-        if measurement is None or received.source in self._unmodelled:
-            return None
-        return self.take(measurement)
+        return None if measurement is None else self.take(measurement)
 
     def take(self, measurement: Measurement) -> Receipt:
         """Fuse an event that is aligned already."""
-        if measurement.source not in self.history.index:
+        history, source = self.history, self.history.index.get(measurement.source)
+        if source is None:
             raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.plan.sources)}")
         try:
             values = self._values(measurement)
         except Unusable as unusable:
             reason = str(unusable)
             self.invalid[measurement.source][reason] += 1
-            outcome = self.history.count(self.history.index[measurement.source], Outcome.INVALID)
-            return Receipt(measurement, outcome, reason)
-        return Receipt(measurement, self.history.offer(measurement, values))
+            return Receipt(measurement, history, history.count(source, Outcome.INVALID), reason)
+        return Receipt(measurement, history, history.offer(source, measurement, values))
 
     def estimate_at(self, t_ns: int) -> Estimate:
         """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
         instant before the head's gives the head itself."""
-        state = self.history.head.copy()
+        state, resets = self._told(self.history.head.copy())
         self.history.kernel.predict(state, t_ns)
-        return self._estimate(state, t_ns)
+        return self._estimate(state, t_ns, resets)
 
     def settled(self) -> Estimate:
         """The estimate at the horizon, which no late event can change any more."""
-        state = self.history.settled()
-        return self._estimate(state, int(state.stamps[T]))
+        state, resets = self._told(self.history.settled())
+        return self._estimate(state, int(state.stamps[T]), resets)
+
+    def hot_start(self) -> Verdict:
+        """What became of the stored state."""
+        return Verdict(int(self.history.head.memory[self.plan.imu_source, LAST_VALUE]))
+
+    def to_store(self) -> StoredState | None:
+        """The newest state, for a hot start of the next run; None while there is none."""
+        head = self.history.head
+        if leads(head, self.plan):
+            head = leading(head)
+        return stored_state(head, self.config) if head.stamps[PHASE] == RUNNING else None
 
     def outcomes(self) -> dict[str, dict[str, int]]:
         """Counts of outcomes by source, by the last word on each event."""
@@ -144,11 +164,18 @@ class Fusion:
             raise Unusable("not finite")
         return values
 
-    def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
+    def _told(self, state: FilterState) -> tuple[FilterState, int]:
+        """What is told of a state, and how often that was reset: that the drive decides on a stored heading counts too."""
+        resets = int(state.stamps[RESETS])
+        if leads(state, self.plan):
+            return leading(state), resets
+        return state, resets + decided(state, self.plan)
+
+    def _estimate(self, state: FilterState, t_ns: int, resets: int) -> Estimate:
         stamps = state.stamps
         age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
         if stamps[PHASE] != RUNNING:
-            return Estimate(t_ns, Mode.ALIGNING, age, int(stamps[RESETS]), None)
+            return Estimate(t_ns, Mode.ALIGNING, age, resets, None)
         answer = state_estimate(state)
         north, east, _ = answer.sigma_position_n()
         mode = Mode.NOMINAL
@@ -156,7 +183,7 @@ class Fusion:
             mode = Mode.LOST
         elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.plan.filter.position_timeout_s):
             mode = Mode.DEAD_RECKONING
-        return Estimate(t_ns, mode, age, int(stamps[RESETS]), answer)
+        return Estimate(t_ns, mode, age, resets, answer)
 
 
 def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:

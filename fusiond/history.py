@@ -1,16 +1,17 @@
 """Every event of the last `horizon` in order of (t_ns, source, sequence), with snapshots of the whole filter state.
 
-Theory of operation. The rows [0, applied) are in the head state; the rest wait for the IMU. An event is inserted where its
-key belongs. If that is among the applied rows, the head is restored from the newest snapshot at or before the first row
-that it changes, and the rows after are run again. So head and outcomes are a function of the set of events alone, whatever
-the order of their arrival.
+Theory of operation. An event is inserted where its key belongs, and that is all until somebody looks at the head, the rows
+or the counts: only then are the rows run, those of many events at once. The rows [0, applied) are in the head state. Where
+an event is inserted among them, the snapshots from the first row on that it changes are dropped, and the head is restored
+from the newest that is left before the rows after it are run again. So head and outcomes are a function of the set of
+events alone, whatever the order of their arrival, and whenever somebody looked.
 
 Which rows does an event change? All after it; and if it is an IMU sample, also those between it and the IMU sample before
 it, because they interpolate between the two. Therefore a snapshot is taken only after an IMU row, or where the IMU has been
 silent for so long that no later sample can change what went before.
 
-Which rows are applied? Those up to the newest IMU sample; and if the IMU has gone silent, those older by `imu_gap` than the
-newest event of all, so that the filter coasts on with its other sensors.
+Which rows are applied when somebody looks? Those up to the newest IMU sample; and if the IMU has gone silent, those older
+by `imu_gap` than the newest event of all, so that the filter coasts on with its other sensors.
 """
 
 from __future__ import annotations
@@ -25,89 +26,89 @@ from fusiond.state import NEVER, FilterState
 
 FIRST_ROWS = 4096
 FIRST_SNAPSHOTS = 64
-FORGET_EVERY = 256  # events
-OUTCOMES = tuple(Outcome)
-WAITING = int(Outcome.WAITING)
+FORGET_EVERY = 256  # events; so many are run at once at the most
 
 
 class History:
-    """The events of the horizon and the filter state behind them. `counts` is (sources, outcomes), by the last word."""
+    """The events of the horizon and the filter state behind them."""
 
     def __init__(self, plan: Plan, compiled: bool | None = None) -> None:
         self.plan = plan
         self.kernel = make_kernel(plan, compiled)
         self.index = {source: i for i, source in enumerate(plan.sources)}
-        self.head = FilterState(len(plan.sources), plan.size)
-        self.counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
         self.rerun = 0  # rows run again because of a late event
+        self.applied_ns = NEVER  # up to where events are applied: a function of the stamps received alone
+        self.settled_ns = NEVER - plan.horizon_ns  # no event older than this is taken any more
+        self._head = FilterState(len(plan.sources), plan.size)
+        self._counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
+        self._lags = [0 if model == IMU else plan.imu_gap_ns for model in plan.models]  # of what is applied behind an event
         self._table: Rows = np.zeros(FIRST_ROWS, dtype=ROW)
         self._begin = self._end = 0  # the live part of the table
-        self._applied = 0  # rows of the live part that are in the head
-        self._newest_imu_ns = self._newest_ns = NEVER
-        self._snapshots = Snapshots(self.head)
+        self._applied = 0  # rows of the live part that are in the head; where it is rewound, in the newest snapshot
+        self._behind = self._rewound = False  # whether there are rows to run, and the head is to be restored before
+        self._snapshots = Snapshots(self._head)
         self._attach()
         self._until_forgetting = FORGET_EVERY
 
     def _attach(self) -> None:
         kept = self._snapshots
-        self.kernel.attach(self.head, self._table, self.counts, kept.numbers, kept.whole, kept.applied)
+        self.kernel.attach(self._head, self._table, self._counts, kept.numbers, kept.whole, kept.applied)
+
+    @property
+    def head(self) -> FilterState:
+        """The state after every event up to `applied_ns`. The same object ever: ask again after an event."""
+        self.catch_up()
+        return self._head
 
     @property
     def rows(self) -> Rows:
         """The live rows, oldest first."""
+        self.catch_up()
         return self._table[self._begin : self._end]
 
     @property
-    def applied_ns(self) -> int:
-        """Up to where events are applied: a function of the stamps received alone."""
-        return max(self._newest_imu_ns, self._newest_ns - self.plan.imu_gap_ns)
+    def counts(self) -> NDArray[np.int64]:
+        """Number of events (sources, outcomes), by the last word on each. The same array ever: ask again after an event."""
+        self.catch_up()
+        return self._counts
 
-    @property
-    def settled_ns(self) -> int:
-        """No event older than this is taken any more."""
-        return self.applied_ns - self.plan.horizon_ns
-
-    def offer(self, measurement: Measurement, values: tuple[float, ...]) -> Outcome:
-        """Put one event where it belongs in time and bring the head up to date. Returns its outcome, for now."""
-        t_ns, source = measurement.t_ns, self.index[measurement.source]
+    def offer(self, source: int, measurement: Measurement, values: tuple[float, ...]) -> Outcome | None:
+        """Put one event where it belongs in time. Returns the reason why it is not kept, None where it is."""
+        t_ns = measurement.t_ns
         if t_ns < self.settled_ns:
             return self.count(source, Outcome.TOO_OLD)
         if self._end == len(self._table):
             self._make_room()
-        if t_ns > self._newest_ns:
-            self._newest_ns = t_ns
-        if self.plan.models[source] == IMU and t_ns > self._newest_imu_ns:
-            self._newest_imu_ns = t_ns
-        kept, limit = self._snapshots, self.applied_ns
-        place, self._applied, kept.end, rerun, done = self.kernel.offer(
-            self._begin,
-            self._end,
-            self._applied,
-            kept.end,
-            limit,
-            t_ns,
-            source,
-            measurement.sequence,
-            measurement.t_receive_ns,
-            WAITING,
-            values,
+        first_changed = self.kernel.offer(
+            self._begin, self._end, t_ns, source, measurement.sequence, measurement.t_receive_ns, values
         )
-        if place < 0:
+        if first_changed < 0:
             return self.count(source, Outcome.DUPLICATE)
         self._end += 1
-        self.rerun += rerun
-        if not done:
-            self._run(limit)
-        outcome: Outcome = OUTCOMES[self.kernel.outcome(self._begin + place)]
+        self._behind = True
+        if first_changed < self._applied:
+            self._rewind(first_changed)
+        reach_ns = t_ns - self._lags[source]
+        if reach_ns > self.applied_ns:
+            self.applied_ns, self.settled_ns = reach_ns, reach_ns - self.plan.horizon_ns
         self._until_forgetting -= 1
         if not self._until_forgetting:
             self._forget()
-        return outcome
+        return None
 
     def count(self, source: int, outcome: Outcome) -> Outcome:
         """Count an event that is not kept."""
-        self.counts[source, outcome] += 1
+        self._counts[source, outcome] += 1
         return outcome
+
+    def outcome(self, measurement: Measurement) -> Outcome:
+        """What became of an event, by now. LookupError where it is not kept any more."""
+        source, sequence = self.index[measurement.source], measurement.sequence
+        self.catch_up()
+        place = self.kernel.place(self._begin, self._end, measurement.t_ns, source, sequence)
+        if place < 0:
+            return Outcome(self._table["outcome"][self._begin + ~place])
+        raise LookupError(f"no event of {measurement.source} at {measurement.t_ns} is kept")
 
     def settled(self) -> FilterState:
         """The newest snapshot that no event still to come can change: the state about a snapshot interval before the
@@ -115,33 +116,46 @@ class History:
         self._forget()
         return self._snapshots.first()
 
-    def _run(self, limit_ns: int) -> None:
-        """Apply the rows up to `limit_ns`: what the kernel's loop left, for want of memory or as not its own."""
+    def _rewind(self, first_changed: int) -> None:
+        """Have the rows run again from the newest snapshot on that holds no changed one."""
+        before, self._applied = self._applied, self._snapshots.rewind(first_changed)
+        self.rerun += before - self._applied
+        self._rewound = True
+
+    def catch_up(self) -> None:
+        """Apply the rows up to `applied_ns`. Whoever looks at the state, the rows or the counts has this done."""
+        if not self._behind:
+            return
         kept, done = self._snapshots, False
-        while not done:
+        if self._rewound:
+            self.kernel.restore(kept.end)
+        self._behind = self._rewound = False
+        while not done:  # the kernel stops for want of memory, and at a row that is not its own
             before = self._applied
-            self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, limit_ns, kept.end)
+            self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, self.applied_ns, kept.end)
             if done:
                 return
             if kept.end == len(kept.applied):
                 kept.make_room()
                 self._attach()
             elif self._applied == before:
-                self._applied = run_one(self.head, self.rows, before, self.counts, self.plan)
+                rows = self._table[self._begin : self._end]
+                self._applied = run_one(self._head, rows, before, self._counts, self.plan)
                 memory = (kept.numbers, kept.whole, kept.applied)
-                kept.end = keep(self.head, self.rows, self._applied, self.plan, memory, kept.end)
+                kept.end = keep(self._head, rows, self._applied, self.plan, memory, kept.end)
 
     def _make_room(self) -> None:
         """Move the live rows to the front of the table, or of a larger one if they fill half of it."""
         self._forget()
         live = self._end - self._begin
         table = self._table if 2 * live < len(self._table) else np.zeros(4 * live, dtype=ROW)
-        table[:live] = self.rows
+        table[:live] = self._table[self._begin : self._end]
         self._table, self._begin, self._end = table, 0, live
         self._attach()
 
     def _forget(self) -> None:
         """Drop the rows and snapshots that no event inside the horizon can need. When this is done changes no result."""
+        self.catch_up()
         self._until_forgetting = FORGET_EVERY
         gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
         self._begin += gone
@@ -167,6 +181,12 @@ class Snapshots:
         state = self._empty.copy()
         state.numbers[:], state.whole[:] = self.numbers[self.begin], self.whole[self.begin]
         return state
+
+    def rewind(self, first_changed: int) -> int:
+        """Drop the newest ones as long as they hold a changed row. Returns the number of rows in the newest left."""
+        while self.applied[self.end - 1] > first_changed:
+            self.end -= 1
+        return int(self.applied[self.end - 1])
 
     def make_room(self) -> None:
         """Move the snapshots to the front of the memory, or of a larger one if they fill half of it."""

@@ -35,26 +35,26 @@ class Innovations:
 
     def __init__(self, vehicle: str, fusion: Fusion) -> None:
         self._vehicle, self._fusion = vehicle, fusion
-        self._pending: list[Receipt] = []
+        self._pending: list[tuple[Receipt, Outcome]] = []  # with the outcome when it was received
 
     def add(self, receipt: Receipt) -> None:
         """Take what was received."""
         if not isinstance(receipt.measurement.payload, ImuSample):
-            self._pending.append(receipt)
+            self._pending.append((receipt, receipt.outcome))
 
     def judged(self) -> Iterator[InnovationMessage]:
         """Those judged since the last time, in order of receipt."""
         receipts, self._pending = self._pending, []
-        kept = [receipt.measurement for receipt in receipts if receipt.outcome in KEPT]
+        kept = [receipt.measurement for receipt, outcome in receipts if outcome in KEPT]
         rows = self._rows(min(measurement.t_ns for measurement in kept)) if kept else {}
-        for left, receipt in zip(range(len(receipts), 0, -1), receipts, strict=True):
+        for left, (receipt, outcome) in zip(range(len(receipts), 0, -1), receipts, strict=True):
             measurement = receipt.measurement
             key = measurement.t_ns, self._fusion.history.index[measurement.source], measurement.sequence
-            row = rows.get(key) if receipt.outcome in KEPT else None
+            row = rows.get(key) if outcome in KEPT else None
             if row is not None and row.outcome is Outcome.WAITING and left <= MOST_PENDING:
-                self._pending.append(receipt)
+                self._pending.append((receipt, outcome))
             else:
-                yield self._message(receipt, row)
+                yield self._message(receipt, outcome if row is None else row.outcome, row)
 
     def _rows(self, since_ns: int) -> dict[tuple[int, int, int], _Row]:
         """What stands in the history since an instant, by stamp, source and sequence."""
@@ -65,7 +65,7 @@ class Innovations:
         columns = (rows[name].tolist() for name in names)
         return {key: _Row(Outcome(outcome), *told) for key, outcome, *told in zip(keys, *columns, strict=True)}
 
-    def _message(self, receipt: Receipt, row: _Row | None) -> InnovationMessage:
+    def _message(self, receipt: Receipt, outcome: Outcome, row: _Row | None) -> InnovationMessage:
         measurement = receipt.measurement
         ratio: float | None = None
         innovation: tuple[float, ...] = ()
@@ -80,7 +80,7 @@ class Innovations:
             source=measurement.source,
             t_ns=measurement.t_ns,
             t_receive_ns=measurement.t_receive_ns,
-            outcome=NAMES[receipt.outcome if row is None else row.outcome],
+            outcome=NAMES[outcome],
             test_ratio=ratio,
             innovation=innovation,
             variance=variance,

@@ -40,6 +40,8 @@ from fusiond.state import (
     CHOOSING,
     EMPTY,
     FORCE_B,
+    HEIGHT_OFFSET,
+    HEIGHT_OFFSET_ERROR,
     HELD_FORCE_B,
     HELD_RATE_B,
     LAST_RATIO,
@@ -101,6 +103,11 @@ LEAST_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
 OUTAGE_NS = 10_000_000_000  # a source silent for longer, or not fused for longer before it was rejected, comes back anew
 SUSPECT = 6  # times gnss_reset_s, where the receiver's velocity is not trusted
+RESETTABLE = {  # what a source resets that was rejected for too long: error states and nominal states
+    MODEL["gnss_position"]: (POSITION, POSITION_E),
+    MODEL["gnss_velocity"]: (VELOCITY, VELOCITY_E),
+    MODEL["barometric_height"]: (HEIGHT_OFFSET_ERROR, HEIGHT_OFFSET),
+}
 NEAR = 9.0  # test ratio up to which a fix after an outage is believed soon
 
 
@@ -133,14 +140,14 @@ class Kernel:
         predict(state, t_ns, self.plan)
 
     def place(self, begin: int, end: int, t_ns: int, source: int, sequence: int) -> int:
-        """Where, counted from `begin`, an event goes among the rows begin..end; -1 if its very key is there already.
-        Most events are new, so the search begins at the end."""
+        """Where, counted from `begin`, an event goes among the rows begin..end; if its very key is there already in row i,
+        ~i, which is negative. Most events are new, so the search begins at the end."""
         i, key = end, (t_ns, source, sequence)
         while i > begin:
             row = self.table[i - 1]
             before = int(row["t_ns"]), int(row["source"]), int(row["sequence"])
             if before == key:
-                return -1
+                return ~(i - 1 - begin)
             if before < key:
                 break
             i -= 1
@@ -183,43 +190,23 @@ class Kernel:
         self,
         begin: int,
         end: int,
-        applied: int,
-        kept: int,
-        limit_ns: int,
         t_ns: int,
         source: int,
         sequence: int,
         t_receive_ns: int,
-        waiting: int,
         values: tuple[float, ...],
-    ) -> tuple[int, int, int, int, bool]:
-        """Place an event, insert it with the outcome `waiting`, rewind to before the first row that it changes, and run up
-        to `limit_ns`. Returns its place (-1: its very key is there already), the rows applied, the snapshots kept, the
-        rows that were un-applied for it, and whether it is done (see `run`)."""
+    ) -> int:
+        """Insert an event where it belongs among the rows begin..end, as waiting. Returns the first row, counted from
+        `begin`, that it changes; a negative number if its very key is there already."""
         place = self.place(begin, end, t_ns, source, sequence)
         if place < 0:
-            return place, applied, kept, 0, True
-        self.insert(begin + place, end, t_ns, source, sequence, t_receive_ns, waiting, values)
-        first_changed = self.first_changed(begin, place)
-        if place < applied:  # for the moment it counts among the applied: the rewind takes it out
-            applied += 1
-        rerun = 0
-        if first_changed < applied:
-            kept = self.restore(kept, first_changed)
-            rerun = applied - int(self.kept_applied[kept - 1])
-            applied -= rerun
-        applied, kept, done = self.run(begin, end + 1, applied, limit_ns, kept)
-        return place, applied, kept, rerun, done
+            return place
+        self.insert(begin + place, end, t_ns, source, sequence, t_receive_ns, Outcome.WAITING, values)
+        return self.first_changed(begin, place)
 
-    def outcome(self, at: int) -> int:
-        return int(self.table[at]["outcome"])
-
-    def restore(self, kept: int, first_changed: int) -> int:
-        """Copy into the head the newest of the snapshots ..kept that holds no changed row. Returns how many remain."""
-        while self.kept_applied[kept - 1] > first_changed:
-            kept -= 1
+    def restore(self, kept: int) -> None:
+        """Copy the last of the snapshots ..kept into the head."""
         self.head.numbers[:], self.head.whole[:] = self.kept_numbers[kept - 1], self.kept_whole[kept - 1]
-        return kept
 
     def run(self, begin: int, end: int, applied: int, limit_ns: int, kept: int) -> tuple[int, int, bool]:
         """Apply to the head the rows from `applied` on (counted from `begin`) up to `limit_ns`, and keep snapshots.
@@ -451,7 +438,7 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
     seen = seen._replace(variance=learnt * health.noisy_factor(memory))
     ratio, fused = update(state, seen, plan.gates[m], factor, trusted, float(parameters[CLUTTER]))
     row["ratio"] = memory[LAST_RATIO] = ratio
-    if not fused and model != MODEL["wheel_speed"] and _locked_out(state, source, seen, t_ns, plan):
+    if not fused and model in RESETTABLE and _locked_out(state, source, seen, t_ns, plan):
         _reset_block(state, seen, model)
         health.begin(memory)
         fused = True
@@ -490,8 +477,12 @@ def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, p
 
 
 def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
-    """Put position or velocity where the receiver says, with the receiver's uncertainty, and count the jump."""
-    block, nominal = (POSITION, POSITION_E) if model == MODEL["gnss_position"] else (VELOCITY, VELOCITY_E)
+    """Put position or velocity where the receiver says, with the receiver's uncertainty, and count the jump. A barometer
+    puts its own offset where the height says: that is no jump."""
+    block, nominal = RESETTABLE[model]
+    if model == MODEL["barometric_height"]:
+        _reset_offset(state, seen)
+        return
     to_n = mat_ne(state.nominal[POSITION_E])
     axes = len(seen.innovation)
     state.nominal[nominal] += to_n[:axes].T @ seen.innovation
@@ -502,6 +493,16 @@ def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
     state.covariance[:, block] = 0.0
     state.covariance[block, block] = to_n.T @ spread @ to_n
     state.stamps[RESETS] += 1
+
+
+def _reset_offset(state: FilterState, seen: Observation) -> None:
+    """The height offset (1,) anew, offset = reading - height, with the covariances that this gives it."""
+    state.nominal[HEIGHT_OFFSET] += seen.innovation
+    state.covariance[HEIGHT_OFFSET_ERROR, :] = state.covariance[:, HEIGHT_OFFSET_ERROR] = 0.0
+    cross = -seen.jacobian @ state.covariance
+    state.covariance[HEIGHT_OFFSET_ERROR, :] = cross
+    state.covariance[:, HEIGHT_OFFSET_ERROR] = cross.T
+    state.covariance[HEIGHT_OFFSET_ERROR, HEIGHT_OFFSET_ERROR] = -cross @ seen.jacobian.T + seen.variance
 
 
 def guard(state: FilterState) -> None:

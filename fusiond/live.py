@@ -18,6 +18,7 @@ from fusiond.latency import RecentLatencies
 from fusiond.messages import Message, StateMessage
 from fusiond.publication import Publication, Surroundings
 from fusiond.sections import Config
+from fusiond.stored import StoredState
 
 MICROSECOND = 1_000  # ns
 MOVED_NS = 100 * MICROSECOND  # less is only to tell apart frames that were read at once
@@ -38,7 +39,7 @@ class Source(Protocol):
 
 class LiveEngine:
     """Engine and inputs of a running daemon. `now` reads the time line; `on_message` takes whatever is to go out;
-    `surroundings` tells the health of the shell; `record` takes kind of file, stamp, bytes."""
+    `surroundings` tells the health of the shell; `record` takes kind of file, stamp, bytes; `stored` is for a hot start."""
 
     def __init__(
         self,
@@ -47,8 +48,9 @@ class LiveEngine:
         on_message: OnMessage,
         surroundings: Callable[[], Surroundings] = Surroundings,
         record: Callable[[str, int, bytes], None] | None = None,
+        stored: StoredState | None = None,
     ) -> None:
-        self.engine = Engine(config, config.publish.rate_hz, self._tick)
+        self.engine = Engine(config, config.publish.rate_hz, self._tick, stored=stored)
         self.publication = Publication(config, self.engine, surroundings)
         self.record = record
         self.moved = self.most_moved_ns = 0  # stamps, see above
@@ -86,14 +88,19 @@ class LiveEngine:
         return whole
 
     def _take(self, t_ns: int, source: Source, item: Any) -> None:
+        taken = 0
         for event in source.decode(item, t_ns):
             self.engine.advance(t_ns)
             receipt = self.engine.take(event)
             if receipt is not None:
                 self.offered += 1
                 self.publication.add(event, receipt)
-                if receipt.outcome is not Outcome.INVALID:
-                    self.to_fusion.add(max(0, self._now() - t_ns))
+                taken += receipt.refusal is not Outcome.INVALID
+        if taken:
+            self.engine.fusion.history.catch_up()  # now, so that a tick finds it done
+            late_ns = max(0, self._now() - t_ns)
+            for _ in range(taken):
+                self.to_fusion.add(late_ns)
         if self.record:
             self.record(source.file, t_ns, source.record(item, t_ns))
 

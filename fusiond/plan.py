@@ -12,7 +12,7 @@ from fusiond.earth import Array
 from fusiond.elementary import square
 from fusiond.observe import CONSTRAINTS, MODELS, wheel_speed
 from fusiond.observe.model import CLUTTER, COMPANION, NOISE_LEAST, NOISE_MOST, PARAMETERS, SHARED
-from fusiond.sections import Barometer, Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
+from fusiond.sections import Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
 from fusiond.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
@@ -136,10 +136,9 @@ def _parameters(source: str, sources: tuple[str, ...], model: int, config: Confi
     row = MODELS[model].parameters(section)
     row[NOISE_LEAST], row[NOISE_MOST] = square(section.noise_least), square(section.noise_most)
     row[SHARED], row[COMPANION] = _shared(section, model, config), -1
-    if model == MODEL["barometric_height"]:
-        return row
     if model == MODEL["wheel_speed"]:
-        row[wheel_speed.SCALE_STATE] = _scale_state(wheel_groups(config)[source])
+        row[wheel_speed.SCALE_STATE] = scale_state(wheel_groups(config)[source])
+    if not isinstance(section, Gnss):
         return row
     row[CLUTTER] = section.outlier_share if section.outliers == "mixture" else 0.0
     velocity = source.removesuffix(".position") + ".velocity"
@@ -148,10 +147,10 @@ def _parameters(source: str, sources: tuple[str, ...], model: int, config: Confi
     return row
 
 
-def _shared(section: Gnss | Wheel | Barometer, model: int, config: Config) -> float:
+def _shared(section: Any, model: int, config: Config) -> float:
     """By what each variance s_i^2 of a group grows so that all of them, fused one by one, are worth no more than their
     shared error s_c allows (THEORY A5): with 1 + s_c^2 sum 1 / s_j^2 they are worth s_c^2 + 1 / sum 1 / s_j^2 together."""
-    if isinstance(section, Barometer) or section.group is None or model == MODEL["gnss_velocity"]:
+    if not isinstance(section, Gnss | Wheel) or section.group is None or model == MODEL["gnss_velocity"]:
         return 1.0
     if isinstance(section, Wheel):
         sigmas = [wheel.sigma_mps for wheel in config.wheel.values() if wheel.group == section.group]
@@ -169,7 +168,7 @@ def _scale_names(config: Config) -> tuple[str, ...]:
     return tuple(f"wheel_scale_{names}" for names in wheels)
 
 
-def _scale_state(group: int) -> int:
+def scale_state(group: int) -> int:
     """The error state of a group's wheel scale."""
     return SCALE.start if group == 0 else FURTHER_SCALES_ERROR.start + group - 1
 
@@ -179,7 +178,7 @@ def _calibrations(config: Config) -> tuple[Array, Array]:
     neither. Short where none of the wider state is wanted: it costs time."""
     settings = config.filter
     first, walks = np.zeros(WIDE_SIZE), np.zeros(WIDE_SIZE)
-    scales = [_scale_state(group) for group in {0, *wheel_groups(config).values()}]
+    scales = [scale_state(group) for group in {0, *wheel_groups(config).values()}]
     first[scales] = square(settings.wheel_scale_sigma)
     walks[scales] = square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0
     first[MOUNT_ERROR] = square(math.radians(settings.mount_sigma_deg))

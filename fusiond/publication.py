@@ -22,6 +22,7 @@ from fusiond.engine import FIELDS, RATE_DENOMINATOR, Engine, totals
 from fusiond.estimate import Mode
 from fusiond.fusion import Fusion, Receipt
 from fusiond.health import STATUSES
+from fusiond.hot_start import decided
 from fusiond.innovations import Innovations
 from fusiond.kernel import Kernel
 from fusiond.measurements import Received
@@ -191,6 +192,7 @@ class Changes:
         self._config, self._fusion = config, fusion
         self._mode: Mode | None = None
         self._resets = self._blown = 0
+        self._decided = False
         self._started: int = NEVER
         self._present: frozenset[str] = frozenset()
         self._statuses = dict.fromkeys(fusion.plan.sources, "nominal")
@@ -209,6 +211,7 @@ class Changes:
                 yield event(kind="reset", severity="warning", subject="", text=f"state reset: {self.reset_reason}")
             self._resets = state.resets
         self._blown, self._started = int(stamps[BLOWN]), int(stamps[T_START])
+        self._decided = decided(self._fusion.history.head, self._fusion.plan)
         if state.mode is not self._mode:
             text = state.mode.value if self._mode is None else f"{self._mode.value} -> {state.mode.value}"
             yield event(kind="mode", severity=SEVERITY[state.mode], subject=state.mode.value, text=f"mode: {text}")
@@ -232,6 +235,8 @@ class Changes:
         """Why the state was reset, as far as it can be seen from the state now."""
         fusion, settings = self._fusion, self._config.filter
         head = fusion.history.head
+        if decided(head, fusion.plan) and not self._decided:
+            return "the drive has decided on the heading, which was a stored one"
         if head.stamps[BLOWN] > self._blown:
             return "it was no longer finite; aligning anew"
         if head.stamps[T_START] != self._started:

@@ -15,7 +15,10 @@ LIVE_CAN = frozenset({"interface", "channel", "config_context", "fd", "bitrate"}
 LIVE_IMU = frozenset({"rate_hz"})
 LIVE_LIVE = frozenset({"reopen_max_s"})
 LIVE_RECORD = frozenset({"folder", "file_mb", "total_mb"})
-LIVE = {"mavlink": LIVE_MAVLINK, "can": LIVE_CAN, "imu": LIVE_IMU, "live": LIVE_LIVE, "record": LIVE_RECORD}
+LIVE_STATE = frozenset({"every_s"})
+LIVE = {"mavlink": LIVE_MAVLINK, "can": LIVE_CAN, "imu": LIVE_IMU, "live": LIVE_LIVE, "record": LIVE_RECORD,
+    "state": LIVE_STATE,
+}
 
 
 class Changes(NamedTuple):

@@ -22,6 +22,7 @@ from fusiond import __version__
 from fusiond.comparison import Comparison, Errors, Truth, TruthError, TruthRow, Window, errors_of, parse_truth
 from fusiond.engine import SECOND, Engine
 from fusiond.fusion import Receipt
+from fusiond.hot_start import WORDS, Verdict
 from fusiond.kernel import Outcome
 from fusiond.measurements import ClockPair, Received
 from fusiond.messages import Message, StateMessage, csv_header, csv_row
@@ -29,10 +30,12 @@ from fusiond.progress import shown
 from fusiond.publication import Publication
 from fusiond.report import DeadReckoningLog, Latencies, Publications, Span, Summary, source_report, to_json
 from fusiond.sections import Config
+from fusiond.stored import StoredState, StoredStateError, check
 from fusiond.toml_file import ConfigError
 from fusiond.trace import Trace
 from fusiond_adapters.logs import LogError
 from fusiond_adapters.logs.merge import open_logs
+from fusiond_adapters.state_file import read_state
 
 WHOLE = Window()
 
@@ -74,6 +77,7 @@ class Wants:
     on_receipt: list[ReceiptSink] = field(default_factory=list)
     on_message: list[MessageSink] = field(default_factory=list)  # everything that a live run would publish at a tick
     window: Window = WHOLE  # of the comparison with the truth
+    stored: StoredState | None = None  # that the run began with
 
 
 class Replay:
@@ -84,7 +88,7 @@ class Replay:
         self.events = self.clock_pairs = 0
         self._wants = wants
         self._ticking = bool(wants.on_tick or wants.on_message) or wants.truth is not None
-        self.engine = Engine(config, wants.rate_hz, self._publish if self._ticking else None, wants.pace)
+        self.engine = Engine(config, wants.rate_hz, self._publish if self._ticking else None, wants.pace, wants.stored)
         self.fusion = self.engine.fusion
         self._publication = Publication(config, self.engine) if wants.on_message else None
         self._withheld: Counter[str] = Counter()
@@ -125,7 +129,7 @@ class Replay:
             return
         if self._publication:
             self._publication.add(event, receipt)
-        if receipt.outcome is not Outcome.INVALID:
+        if receipt.refusal is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)
         for sink in self._wants.on_receipt:
@@ -241,6 +245,7 @@ class Options:
     truth: Path | None = None
     plot: Path | None = None
     mcap: Path | None = None
+    stored: Path | None = None
     withheld: Sequence[Withheld] = ()
     window: Window = WHOLE
     rate_hz: float | None = None  # default: the configuration's
@@ -257,6 +262,7 @@ def replay(options: Options) -> Summary:
     config = options.config
     logs = open_logs(options.logs, config)
     wants = Wants(options.rate_hz or config.publish.rate_hz, options.withheld, window=options.window)
+    wants.stored = _stored(options.stored, config) if options.stored else None
     trace = Trace() if options.plot else None
     if trace:
         wants.on_tick.append(trace.add_tick)
@@ -276,6 +282,8 @@ def replay(options: Options) -> Summary:
         raise LogError(f"nothing in the logs that the configuration asks for ({met})")
     warnings = [_renamed(warning, names) for warning in logs.warnings]
     summary = run.summary(options.config_name, {names[path]: counts for path, counts in logs.counts.items()}, warnings)
+    if wants.stored and (verdict := run.fusion.hot_start()) is not Verdict.BELIEVED:
+        warnings.append(f"stored state: {WORDS[verdict]}")
     if options.truth and summary.truth is None:
         warnings.append(f"{options.truth.name}: no published state to compare with it; is it of this drive?")
     if options.json:
@@ -287,6 +295,18 @@ def replay(options: Options) -> Summary:
         with _delivering(options.plot):
             draw(trace, summary, options.plot)
     return summary
+
+
+def _stored(path: Path, config: Config) -> StoredState:
+    """The stored state that a recording began with. Raises LogError."""
+    try:
+        stored = read_state(path)
+        if stored is None:
+            raise StoredStateError("there is no such file")
+        check(stored, config)
+    except StoredStateError as error:
+        raise LogError(f"{path}: {error}") from error
+    return stored
 
 
 def _checked_truth(path: Path) -> Iterator[TruthRow]:
@@ -312,7 +332,8 @@ def _read_truth(path: Path) -> Iterator[TruthRow]:
 def _add_outputs(options: Options, wants: Wants, stack: ExitStack) -> None:
     """Open what every tick goes to; what cannot be written is found before the work begins."""
     outputs = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
-    inputs = {Path(log).resolve() for log in options.logs} | ({options.truth.resolve()} if options.truth else set())
+    inputs = {Path(log).resolve() for log in options.logs}
+    inputs |= {path.resolve() for path in (options.truth, options.stored) if path}
     for path in outputs:
         if path.resolve() in inputs:
             raise UsageError(f"{path}: is an input, and would be overwritten")

@@ -152,12 +152,18 @@ class Gnss(Section, frozen=True, kw_only=True):
 
 
 class Barometer(Section, frozen=True, kw_only=True):
-    """[barometer.NAME]: a static pressure sensor."""
+    """[barometer.NAME]: a static pressure sensor, taken as a height with an unknown offset. At most one."""
 
     link: Name  # the [mavlink.LINK] it comes by
     message: PressureMessage = "SCALED_PRESSURE"  # the message that carries it
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # readings a second to ask the autopilot for, live
     delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true
+    sigma_m: Positive = 1.0  # noise of one reading, as a height: wind, draught, and what speed does to static pressure
+    correlation_s: NotNegative = 1.0  # time over which its errors stay alike
+    noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_m
+    noise_most: Positive = 3.0  # and up to this
+    offset_sigma_m: Positive = 100.0  # first sigma of what it reads too much, which is learnt: weather and geoid
+    offset_walk_m: NotNegative = 0.1  # its random walk [m/sqrt(s)]: weather, and air that is not the standard's
 
 
 class Wheel(Section, frozen=True, kw_only=True):
@@ -228,6 +234,14 @@ class Record(Section, frozen=True, kw_only=True):
     folder: str | None = None  # such as "/var/lib/fusiond/box"; none: nothing is recorded
     file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # a file that has grown to this is followed by another
     total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
+
+
+class State(Section, frozen=True, kw_only=True):
+    """[state]: the state that `fusiond run` keeps on disk, for a hot start."""
+
+    file: str | None = None  # such as "/var/lib/fusiond/state.json"; none: every start is a cold one
+    every_s: Annotated[float, Meta(ge=1, le=86400)] = 10.0  # it is written this often, and at the end
+    max_age_s: Annotated[float, Meta(gt=0, le=1e9)] = 604800.0  # one older than this is ignored; default: a week
 
 
 class Mcap(Section, frozen=True, kw_only=True):
@@ -314,6 +328,7 @@ class Config(Section, frozen=True, kw_only=True):
     zenoh: Zenoh = field(default_factory=Zenoh)
     live: Live = field(default_factory=Live)
     record: Record = field(default_factory=Record)
+    state: State = field(default_factory=State)
     autopilot: Autopilot = field(default_factory=Autopilot)
     ground_station: GroundStation = field(default_factory=GroundStation)
     mcap: Mcap = field(default_factory=Mcap)
@@ -335,7 +350,7 @@ class Config(Section, frozen=True, kw_only=True):
     def sources(self) -> tuple[str, ...]:
         """Every source of measurements, in the order that breaks ties of time."""
         gnss = [f"{name}.{kind}" for name in self.gnss for kind in ("position", "velocity")]
-        return tuple(sorted([*self.imu, *gnss, *self.wheel]))
+        return tuple(sorted([*self.imu, *gnss, *self.wheel, *self.barometer]))
 
 
 MOST_SCALES = 4

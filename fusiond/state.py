@@ -65,7 +65,8 @@ SMOOTH_FORCE_B = slice(36, 39)  # m/s^2, mean over the delays of receivers
 AUXILIARY_SIZE = 39
 
 # Remembered of each source: columns of FilterState.memory
-LAST_VALUE = 0  # last reading of a wheel [m/s]; of a GNSS velocity, the least horizontal speed that it leaves possible
+LAST_VALUE = 0  # last reading of a wheel [m/s]; of a GNSS velocity, the least horizontal speed that it leaves possible;
+# of the inertial sensor, what became of the stored state (fusiond.hot_start.Verdict)
 LAST_RATIO = 1  # test ratio of the last update
 NOISE_EXCESS = 2  # learnt variance over the configured one, less 1
 BELIEF = slice(3, 7)  # probabilities (fusiond.health); all 0 before the first look
@@ -106,6 +107,7 @@ SOURCE_STAMPS_SIZE = 6
 
 EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
 HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.bank): twelve all round, and a stored one
+STORED = 12  # the number of that
 NEVER = -(2**62)
 
 

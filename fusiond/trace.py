@@ -82,7 +82,7 @@ class Trace:
 
     def add_receipt(self, receipt: Receipt) -> None:
         fix = receipt.measurement.payload
-        if not isinstance(fix, GnssPosition) or receipt.outcome is Outcome.INVALID:
+        if not isinstance(fix, GnssPosition) or receipt.refusal is Outcome.INVALID:
             return
         north, east = self._place(math.degrees(fix.latitude), math.degrees(fix.longitude), fix.height)
         kept = self.rejected if receipt.outcome is Outcome.REJECTED else self.fixes

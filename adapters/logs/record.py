@@ -1,6 +1,7 @@
 """The black box: what was received, in native formats, in files of bounded size, the oldest of which go in time.
 
-A file is named by the instant of its first frame, then `LINK.tlog` or `can.log`, so that names sort by time. Frames are
+A file is named by the instant of its first frame, then `LINK.tlog`, `can.log`, or `state.json` for the stored state that
+the run began with, so that names sort by time. Frames are
 handed over without waiting; a thread writes them. When the disk is full or slow, frames are lost to the box alone: they
 are counted, and the box goes on with a new file as soon as it can.
 """
@@ -20,7 +21,7 @@ MEGABYTE = 1_000_000
 MOST_WAITING = 100_000  # records between the engine and the disk
 FLUSH_S = 1.0  # what is lost at a crash, at the most
 RETRY_NS = 5_000_000_000  # after an error records are passed over for so long before the disk is tried again
-NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-\w+\.(tlog|log)")  # nothing else in the folder is ever removed
+NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-\w+\.(tlog|log|json)")  # nothing else in the folder is ever removed
 
 
 def file_name(t_ns: int, kind: str) -> str:

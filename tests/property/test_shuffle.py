@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from fusiond.fusion import Fusion
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Payload, WheelSpeed
 from fusiond.sections import Config
-from fusiond.state import PHASE, RUNNING
+from fusiond.state import PHASE, RUNNING, T
 from tests.conftest import needs_compiled
 from tests.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
 
@@ -33,6 +33,7 @@ CASES = st.fixed_dictionaries(
         "snapshot_interval_s": st.sampled_from([0.0, 0.01, 0.05, 0.3]),
         "imu_hole": st.booleans(),
         "correlation_s": st.sampled_from([0.0, 0.5]),
+        "look_every": st.sampled_from([1, 1, 1, 10, 10**6]),  # events: they are run when somebody looks
     }
 )
 Case = dict[str, float]
@@ -113,10 +114,15 @@ def check(case: Case, compiled: bool) -> None:
     prefix, events = stretch(case)
     settings_ = configuration(case)
     in_order = fuse(settings_, prefix + events, compiled)
-    shuffled = fuse(settings_, prefix + arrival(events, case), compiled)
+    shuffled = Fusion(settings_, compiled)
+    for number, event in enumerate(prefix + arrival(events, case)):
+        shuffled.take(event)
+        if number % case["look_every"] == 0:
+            assert shuffled.history.head.stamps[T] <= shuffled.history.applied_ns
     assert in_order.history.head.stamps[PHASE] == RUNNING
     assert sum(in_order.totals().values()) == len(prefix) + len(events)
     assert in_order.totals()["TOO_OLD"] == 0
+    assert shuffled.history.rerun > 0 or case["look_every"] > 10
     same_bits(in_order, shuffled)
 
 

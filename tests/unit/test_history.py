@@ -42,6 +42,15 @@ def delayed(late: Iterable[Measurement], by_ns: int, events: list[Measurement] =
     return sorted(events, key=lambda event: (event.t_ns + (by_ns if id(event) in held else 0), event.key))
 
 
+def looked_at(configuration: Config, events: list[Measurement], compiled: bool) -> Fusion:
+    """A filter that took the events in the order given, and applied each before the next came."""
+    fusion = Fusion(configuration, compiled)
+    for offered in events:
+        fusion.take(offered)
+        assert fusion.history.head.stamps[T] <= fusion.history.applied_ns
+    return fusion
+
+
 def outcomes(fusion: Fusion, source: str) -> dict[str, int]:
     return {name: count for name, count in fusion.outcomes()[source].items() if count}
 
@@ -66,16 +75,31 @@ def test_late_events_on_the_twin() -> None:
 @LONG
 def test_one_late_event_reruns_what_lies_after_it(compiled: bool) -> None:
     fix = next(event for event in EVENTS if event.source == "gps0.position" and event.t_ns > T0 + 8 * SECOND)
-    fusion = fuse(settings(), delayed([fix], 400 * MS), compiled)
-    rows = len([event for event in EVENTS if fix.t_ns - 50 * MS < event.t_ns <= fix.t_ns + 400 * MS])
+    before = [event for event in EVENTS if event.t_ns <= fix.t_ns + 400 * MS]
+    fusion = looked_at(settings(), [event for event in before if event is not fix], compiled)
+    assert fusion.history.rerun == 0
+    assert fusion.take(fix).outcome is Outcome.FUSED
+    rows = len([event for event in before if event.t_ns > fix.t_ns - 50 * MS])
     assert 0.8 * rows < fusion.history.rerun <= rows
-    same_bits(fusion, fuse(settings(), EVENTS, compiled))
+    same_bits(fusion, fuse(settings(), before, compiled))
+
+
+@LONG
+def test_events_that_come_late_together_are_run_once(compiled: bool) -> None:
+    late = [event for event in EVENTS if "gps0" in event.source and T0 + 8 * SECOND < event.t_ns < T0 + 8.3 * SECOND]
+    before = [event for event in EVENTS if event.t_ns <= T0 + 8.5 * SECOND]
+    fusion = looked_at(settings(), [event for event in before if event not in late], compiled)
+    receipts = [fusion.take(event) for event in late]
+    assert len(receipts) > 2
+    assert {receipt.outcome for receipt in receipts} == {Outcome.FUSED}
+    assert 0 < fusion.history.rerun <= len([event for event in before if event.t_ns > late[0].t_ns - 50 * MS])
+    same_bits(fusion, fuse(settings(), before, compiled))
 
 
 @LONG
 def test_events_in_order_are_run_once(compiled: bool) -> None:
     """Wheels stamped with the IMU's own instants too."""
-    fusion = fuse(settings(), EVENTS, compiled)
+    fusion = looked_at(settings(), EVENTS, compiled)
     assert any(row["t_ns"] in fusion.history.rows["t_ns"][i + 1 :] for i, row in enumerate(fusion.history.rows))
     assert fusion.history.rerun == 0
 
@@ -161,7 +185,7 @@ def test_a_silent_imu_does_not_stop_the_others(compiled: bool) -> None:
     for following in EVENTS:
         if following.t_ns >= until(6.9)[-1].t_ns and following not in silent:
             fusion.take(following)
-    np.testing.assert_array_equal(head.numbers, fuse(settings(), EVENTS, compiled).history.head.numbers)
+    np.testing.assert_array_equal(fusion.history.head.numbers, fuse(settings(), EVENTS, compiled).history.head.numbers)
 
 
 @LONG
@@ -179,6 +203,17 @@ def test_a_stamp_from_the_future_only_waits(compiled: bool) -> None:
     before = fusion.history.head.numbers.copy()
     assert fusion.take(event("rear_left", T0 + 6 * SECOND + 150 * MS, WheelSpeed(10.0))).outcome == Outcome.WAITING
     np.testing.assert_array_equal(fusion.history.head.numbers, before)
+
+
+def test_a_forgotten_event_has_no_outcome_any_more(compiled: bool) -> None:
+    fusion, first = Fusion(settings(), compiled), until(2.5)[0]
+    receipt = fusion.take(first)
+    assert receipt.outcome in (Outcome.FUSED, Outcome.WAITING)
+    for following in until(2.5)[1:]:
+        fusion.take(following)
+    fusion.settled()  # forgets what it may
+    with pytest.raises(LookupError, match=rf"no event of {first.source} at {first.t_ns} is kept"):
+        _ = receipt.outcome
 
 
 @LONG
