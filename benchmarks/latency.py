@@ -31,6 +31,7 @@ from fusiond import __version__, config
 from fusiond.client import Client
 from fusiond.daemon import Daemon, punctual_loop, serve
 from fusiond.messages import StateMessage
+from fusiond.sections import Config
 
 IMU_HZ, GNSS_HZ, CAN_HZ, PUBLISH_HZ = 400, 10, 100, 100
 GNSS_LATE_US = 200_000
@@ -47,7 +48,7 @@ def free_port(kind: socket.SocketKind) -> int:
         return int(probe.getsockname()[1])
 
 
-def configuration(folder: Path, udp: int, tcp: int) -> config.Config:
+def configuration(folder: Path, udp: int, tcp: int) -> Config:
     (folder / "wheels.dbc").write_text(DBC)
     wheels = "".join(f'[wheel.{name}]\nbus = "car"\nmessage = "WHEELS"\nsignal = "{name}"\n' for name in WHEELS)
     text = f"""

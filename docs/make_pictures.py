@@ -1,12 +1,14 @@
-"""Draw the pictures of the documentation into docs/images/: python docs/make_pictures.py (needs the extra `plot`)
+"""Draw the pictures of the documentation into docs/images/: python docs/make_pictures.py [NAME ...] (needs the extra `plot`)
 
 The picture of the captured drive needs that drive in ../shared/data, beside the project; without it, it is left out.
 """
 
 import csv
 import math
+import re
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +20,18 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from fusiond import config, demo
+from fusiond.bank import alive
 from fusiond.comparison import Truth, Window, displacement, parse_truth
+from fusiond.fusion import state_estimate
+from fusiond.health import STATUSES
 from fusiond.messages import EventMessage, HealthMessage, Message, StateMessage
 from fusiond.replay import Options, Replay, Wants, replay
 from fusiond.report import Summary
+from fusiond.simulation.scenario import parse
+from fusiond.state import CHOOSING, LAST_VALUE, PHASE
 from fusiond.top import View, screen
 from fusiond_adapters.logs.merge import open_logs
+from fusiond_adapters.logs.write import write_drive
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -77,9 +85,8 @@ def draw_arrival() -> None:
         print("arrival.png left out: the captured drive is not beside the project", file=sys.stderr)
         return
     text = CAR.read_text(encoding="utf-8")
-    arrival = text.replace("[gnss.gps0]", '[gnss.gps0]\nstamp = "arrival"').replace(
-        "velocity_delay_ms = 55.0", "velocity_delay_ms = 0.0"
-    )
+    learnt = re.compile(r"^(velocity_)?delay_sigma_ms = .*\n", re.MULTILINE)
+    arrival = learnt.sub("", text).replace("[gnss.gps0]", '[gnss.gps0]\nstamp = "arrival"')
     runs = (("each fix at its own time", BLUE, text), ("each fix at its arrival", VERMILION, arrival))
     figure = figure_of(9, 5)
     axes = figure.subplots(2, 1, sharex=True)
@@ -179,6 +186,138 @@ def arrow(ax: Axes, tail: tuple[float, float], head: tuple[float, float], colour
     ax.annotate("", head, tail, arrowprops=look)
 
 
+# --- Simulated drives: the heading bank choosing, a slip being named
+
+REVERSES = """
+truth_rate_hz = 20
+[start]
+heading_deg = 120.0
+[[segment]]
+duration_s = 6
+[[segment]]
+duration_s = 5
+speed_mps = -2.5
+[[segment]]
+duration_s = 6
+turn_deg = 40.0
+[[segment]]
+duration_s = 3
+"""
+SLIPS = """
+truth_rate_hz = 20
+[start]
+heading_deg = 30.0
+speed_mps = 10.0
+[[segment]]
+duration_s = 10
+turn_deg = 30.0
+[[segment]]
+duration_s = 10
+speed_mps = 13.0
+[[segment]]
+duration_s = 10
+turn_deg = -30.0
+[[wheels.slip]]
+wheel = "rear_left"
+start_s = 15
+stop_s = 20
+factor = 1.3
+"""
+
+
+class Seen(NamedTuple):
+    """What was looked at in a drive: at each publication the second, and what of interest there was."""
+
+    second: list[float]
+    looks: list[tuple[float, ...]]
+    truth: dict[str, list[float]]  # columns by name, and `second`
+
+
+def seen(scenario: str, look: Callable[[Replay, StateMessage], tuple[float, ...]]) -> Seen:
+    """Simulate a drive, fuse it, and take a look at every publication."""
+    second: list[float] = []
+    looks: list[tuple[float, ...]] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_drive(parse(scenario), folder)
+        settings = config.load(folder / "fusiond.toml")
+
+        def take(message: StateMessage, _: object) -> None:
+            second.append(run.elapsed_ns / 1e9)
+            looks.append(look(run, message))
+
+        run = Replay(settings, Wants(50.0, on_tick=[take]))
+        run.run(open_logs([str(folder / "drive.tlog"), str(folder / "drive.log")], settings))
+        with (folder / "truth.csv").open() as file:
+            rows = list(csv.DictReader(file))
+    truth = {column: [float(row[column]) for row in rows] for column in rows[0]}
+    truth["second"] = [(t_us - truth["unix_us"][0]) / 1e6 for t_us in truth["unix_us"]]
+    return Seen(second, looks, truth)
+
+
+def draw_bank() -> None:
+    """How the heading is found: a vehicle that reverses out of its parking place."""
+
+    def look(run: Replay, message: StateMessage) -> tuple[float, ...]:
+        """The one yaw and its sigma; before that not a number, and weight and yaw of each hypothesis that is left."""
+        head = run.fusion.history.head
+        if message.state:
+            return message.state.yaw_deg % 360, message.state.sigma_yaw_deg
+        left = alive(head) if head.stamps[PHASE] == CHOOSING else []
+        yaws = (math.degrees(state_estimate(head.hypothesis(i)).euler()[2]) % 360 for i in left)
+        return (math.nan, *(number for i, yaw in zip(left, yaws, strict=True) for number in (float(head.bank[i, 0]), yaw)))
+
+    second, looks, truth = seen(REVERSES, look)
+    figure = figure_of(9, 4.4)
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    choosing = [(t, values[1:]) for t, values in zip(second, looks, strict=True) if math.isnan(values[0])]
+    for t, values in choosing[::2]:
+        top.scatter([t] * (len(values) // 2), values[1::2], s=60 * np.array(values[::2]) + 1, color=BLUE, linewidths=0)
+    t, yaw, sigma = np.array([(t, *values) for t, values in zip(second, looks, strict=True) if values[0] >= 0]).T
+    top.fill_between(t, yaw - 3 * sigma, yaw + 3 * sigma, color=GREEN, alpha=0.25, linewidth=0)
+    top.plot(t, yaw, color=GREEN, label="the filter runs (band: 3 sigma)")
+    top.plot(truth["second"], np.array(truth["yaw_deg"]) % 360, "--", color=VERMILION, linewidth=1.2, label="true heading")
+    top.scatter([], [], s=40, color=BLUE, label="hypotheses, as large as their weight")
+    top.set(ylabel="heading [deg]", ylim=(0, 360), yticks=range(0, 361, 60))
+    top.legend(loc="upper right", frameon=False, fontsize=8)
+    top.set_title("Start without a heading, in reverse; the wheels do not tell the direction", loc="left", fontsize=10)
+    bottom.plot(truth["second"], -np.hypot(truth["vn_mps"], truth["ve_mps"]), color=GREY)
+    bottom.set(ylabel="speed [m/s]", xlabel="time [s]", xlim=(0, second[-1]))
+    save(figure, "bank.png")
+
+
+def draw_slip() -> None:
+    """How a wheel that slips is named and dropped."""
+
+    def look(run: Replay, message: StateMessage) -> tuple[float, ...]:
+        """Speed as estimated and as the wheel has it, and what the wheel is held to be."""
+        head, history = run.fusion.history.head, run.fusion.history
+        wheel = float(head.memory[history.index["rear_left"], LAST_VALUE])
+        speed = math.hypot(*message.state.velocity_ned_mps[:2]) if message.state else math.nan
+        return speed, wheel, *run.fusion.beliefs(message.t_ns)["rear_left"].probabilities
+
+    second, looks, truth = seen(SLIPS, look)
+    speed, wheel, *beliefs = np.array(looks).T
+    figure = figure_of(9, 4.4)
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    top.plot(second, wheel, color=VERMILION, linewidth=1.0, label="rear left wheel")
+    top.plot(second, speed, color=BLUE, linewidth=1.6, label="estimate")
+    top.plot(truth["second"], np.hypot(truth["vn_mps"], truth["ve_mps"]), "--", color=GREY, linewidth=1.0, label="truth")
+    top.set(ylabel="speed [m/s]", ylim=(8, None))
+    top.legend(loc="upper left", frameon=False, fontsize=8)
+    top.set_title("A wheel spins 30 % too fast from 15 s to 20 s", loc="left", fontsize=10)
+    colours = (GREEN, BLUE, VERMILION, ORANGE, GREY)
+    bottom.stackplot(second, *beliefs, colors=colours, labels=STATUSES, alpha=0.8, linewidth=0)
+    bottom.set(ylabel="what it is held to be", xlabel="time [s]", xlim=(12, 24), ylim=(0, 1))
+    bottom.legend(loc="center left", framealpha=0.9, fontsize=8)
+    save(figure, "slip.png")
+
+
+def save(figure: Figure, name: str) -> None:
+    figure.savefig(IMAGES / name)
+    shrink(IMAGES / name)
+
+
 # --- What `fusiond top` shows
 
 TOP_SECOND = 62.0  # of the bundled drive: eight seconds into the tunnel
@@ -218,9 +357,16 @@ def draw_top() -> None:
     shrink(path)
 
 
+PICTURES = {
+    "rewind": draw_rewind,
+    "demo": draw_demo,
+    "arrival": draw_arrival,
+    "bank": draw_bank,
+    "slip": draw_slip,
+    "top": draw_top,
+}
+
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
-    draw_rewind()
-    draw_demo()
-    draw_arrival()
-    draw_top()
+    for wanted in sys.argv[1:] or PICTURES:
+        PICTURES[wanted]()

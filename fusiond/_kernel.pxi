@@ -1953,12 +1953,11 @@ cdef class Kernel:
         if off or stamps[T_ALIKE] == NEVER or row.t_ns - stamps[T_LAST] > BREAK_NS:
             stamps[T_ALIKE] = row.t_ns
             return False
-        if companion >= 0 and not is_trusted(self.memory + companion * MEMORY_SIZE):
+        if (stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS) and memory[LAST_RATIO] <= NEAR:
+            wait = self.gnss_return
+        elif self.models[row.source] == GNSS_VELOCITY or (
+                companion >= 0 and not is_trusted(self.memory + companion * MEMORY_SIZE)):
             wait = SUSPECT * wait
-        elif stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS or \
-                stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS:
-            if memory[LAST_RATIO] <= NEAR:
-                wait = self.gnss_return
         return row.t_ns - stamps[T_ALIKE] >= wait
 
     cdef void reset_block(self, Observation* seen, int block) noexcept nogil:

@@ -36,6 +36,8 @@ from fusiond.state import (
 from fusiond.update import ADDED, cholesky, inject, update, whiten
 
 LEAST_WEIGHT = 1e-9  # a hypothesis less likely than this is given up
+FAR = math.radians(30.0)  # rad: a heading this far off is another one, not the same less sure
+DOUBT = 1e-4  # the bank is not collapsed while headings that are far off are likelier than this, all together
 CLUTTER = OUTLIERS  # share of measurements that fit nothing
 
 
@@ -120,7 +122,8 @@ def normalise(state: FilterState) -> None:
 
 
 def settle(state: FilterState, plan: Plan) -> None:
-    """Normalise, and collapse the bank where the headings are close together: the filter then runs."""
+    """Normalise, and collapse the bank where the headings are close together and hardly any is far off: the
+    filter then runs."""
     normalise(state)
     kept = alive(state)
     if not kept:
@@ -138,7 +141,10 @@ def settle(state: FilterState, plan: Plan) -> None:
     for i, turn in zip(kept, turns, strict=True):
         own = float(down_e @ state.hypothesis(i).covariance[ATTITUDE, ATTITUDE] @ down_e)
         spread += state.bank[i, 0] * (own + (turn - mean) * (turn - mean))
-    if spread <= plan.heading_variance:
+    doubt = 0.0
+    for i, turn in zip(kept, turns, strict=True):
+        doubt += state.bank[i, 0] if abs(turn) > FAR else 0.0
+    if spread <= plan.heading_variance and doubt <= DOUBT:
         _collapse(state, best, kept, errors)
 
 

@@ -101,8 +101,8 @@ Rows = NDArray[Any]  # structured, of dtype ROW
 
 LEAST_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
-OUTAGE_NS = 10_000_000_000  # a source silent for longer, or not fused for longer before it was rejected, comes back anew
-SUSPECT = 6  # times gnss_reset_s, where the receiver's velocity is not trusted
+OUTAGE_NS = 10_000_000_000  # a source silent for longer comes back anew, and is new for as long
+SUSPECT = 6  # times gnss_reset_s, where the receiver's motion is in question
 RESETTABLE = {  # what a source resets that was rejected for too long: error states and nominal states
     MODEL["gnss_position"]: (POSITION, POSITION_E),
     MODEL["gnss_velocity"]: (VELOCITY, VELOCITY_E),
@@ -455,7 +455,8 @@ def _measure(state: FilterState, row: Any, plan: Plan) -> None:
 
 def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, plan: Plan) -> bool:
     """Whether a GNSS source has been rejected for so long, off alike all the time, that the state is the more likely
-    culprit: soon after an outage, later otherwise, and much later while the receiver contradicts itself."""
+    culprit: soon after an outage; later otherwise; and much later for a velocity, or a position whose velocity is not
+    trusted, because the rest of the vehicle then contradicts the receiver's motion, as in a drift-off."""
     memory, stamps = state.memory[source], state.source_stamps[source]
     gate = plan.gates[len(seen.innovation)]
     off = health.moved(memory, seen.innovation, seen.variance, gate)
@@ -464,15 +465,11 @@ def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, p
         return False
     wait = plan.gnss_reset_ns
     companion = int(plan.parameters[source, COMPANION])
-    if companion >= 0 and not health.is_trusted(state.memory[companion]):
+    returns = stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
+    if returns and memory[LAST_RATIO] <= NEAR:
+        wait = plan.gnss_return_ns
+    elif source in plan.velocities or (companion >= 0 and not health.is_trusted(state.memory[companion])):
         wait = SUSPECT * wait
-    elif (
-        stamps[T_FUSED] == NEVER
-        or stamps[T_ALIKE] - stamps[T_FUSED] > OUTAGE_NS
-        or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
-    ):
-        near = memory[LAST_RATIO] <= NEAR
-        wait = plan.gnss_return_ns if near else wait
     return t_ns - int(stamps[T_ALIKE]) >= wait
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
 from fusiond.simulation import wheels
+from fusiond.simulation.barometer import CENTI_CELSIUS
 from fusiond.simulation.drive import Drive, simulate
 from fusiond.simulation.gnss import UNKNOWN_16
 from fusiond.simulation.matching import configuration, dbc
@@ -56,7 +57,7 @@ def write_tlog(drive: Drive, path: Path) -> None:
     """The MAVLink messages in the order of receipt, as MAVLink 2 frames behind their stamps."""
     link = common.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     telemetry = (_telemetry(drive.truth, stream) for stream in drive.telemetry)
-    streams = (_imu(drive), _gnss(drive), _system_time(drive), _heartbeats(drive), *telemetry)
+    streams = (_imu(drive), _gnss(drive), _system_time(drive), _heartbeats(drive), _pressure(drive), *telemetry)
     with path.open("wb") as file:
         for t_us, counter, message in heapq.merge(*streams, key=itemgetter(0)):
             link.seq = counter
@@ -114,6 +115,12 @@ def _heartbeats(drive: Drive) -> Stamped:
             system_status=common.MAV_STATE_ACTIVE,
             mavlink_version=3,
         )
+
+
+def _pressure(drive: Drive) -> Stamped:
+    columns = (drive.barometer.t_receive_us, drive.barometer.counter, drive.barometer.boot_ms, drive.barometer.hectopascal)
+    for t_us, counter, boot_ms, hectopascal in zip(*(column.tolist() for column in columns), strict=True):
+        yield t_us, counter, common.MAVLink_scaled_pressure_message(boot_ms, hectopascal, 0.0, CENTI_CELSIUS)
 
 
 def _telemetry(truth: Truth, stream: Telemetry) -> Stamped:

@@ -60,7 +60,8 @@ def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
         raise Unusable("impossible position" if math.isfinite(fix.height) else "not finite")
     horizontal = max(fix.sigma_horizontal or 0.0, gnss.position_sigma_m)
     vertical = max(fix.sigma_vertical or 0.0, gnss.height_sigma_m)
-    return (*(float(c) for c in ecef(fix.latitude, fix.longitude, fix.height)), square(horizontal), square(vertical))
+    x, y, z = ecef(fix.latitude, fix.longitude, fix.height).tolist()
+    return x, y, z, square(horizontal), square(vertical)
 
 
 def observe(state: FilterState, row: Array, parameter: Array) -> Observation:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 ETC = Path("/etc/fusiond")
 PORT, ENDPOINT = 14550, "tcp/127.0.0.1:7447"
 EXPOSURE = 2.0  # the most that systemd may find
-TRACE_RMSE_M = 1.0  # of the captured trace: 0.42 m replayed
+TRACE_RMSE_M = 1.0  # of the captured trace: 0.31 m replayed
 READY_S = 15.0
 MISSING_SHARE = 0.02  # of the states: a reader that is slow on a slow machine
 

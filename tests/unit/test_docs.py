@@ -1,15 +1,21 @@
 """The documentation: generated tables are up to date, links resolve, pictures are small, examples are what they say."""
 
+import argparse
 import importlib.util
 import re
 import tomllib
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 
-from fusiond import config, sections
+from fusiond import config, measurements, sections
+from fusiond.__main__ import parser
+from fusiond.observe.model import mat_eb
 from fusiond.simulation import scenario
+from fusiond.state import VELOCITY, VELOCITY_E, FilterState
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -69,10 +75,16 @@ def test_every_page_is_linked_from_the_readme() -> None:
     assert all(f"(docs/{page.name})" in text for page in DOCS.glob("*.md"))
 
 
+def test_every_command_is_in_the_readme() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (commands,) = (action for action in parser()._actions if isinstance(action, argparse._SubParsersAction))
+    assert all(f"\n| `fusiond {command}` |" in text for command in commands.choices)
+
+
 def test_pictures_are_used_and_small() -> None:
     texts = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    for picture in (DOCS / "images").iterdir():
-        assert f"images/{picture.name})" in texts
+    for picture in (DOCS / "images").rglob("*.png"):
+        assert f"{picture.relative_to(DOCS).as_posix()})" in texts
         assert picture.stat().st_size <= LARGEST_PICTURE
 
 
@@ -88,6 +100,22 @@ def test_the_examples_of_the_workshop_guide_hold(tmp_path: Path) -> None:
     first, wheel = examples("tuning.md", "toml")
     parsed = config.parse(f"{first}\n{wheel}", tmp_path / "car.toml")
     assert parsed.wheel["rear_left"].counter_signal == "COUNTER"
+
+
+def test_the_example_of_a_model_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 10 m/s forward, with the radar 2 m ahead of the IMU."""
+    monkeypatch.setattr(sections, "Radar", sections.Wheel, raising=False)
+    monkeypatch.setattr(measurements, "RadarSpeed", measurements.WheelSpeed, raising=False)
+    model: dict[str, Any] = {}
+    exec(examples("adding.md", "python")[0], model)
+    radar = sections.Wheel(position_m=(2.0, 0.0, 0.5), sigma_mps=0.1)
+    state = FilterState(1)
+    state.nominal[VELOCITY_E] = mat_eb(state) @ (10.0, 0.0, 0.0)
+    row = np.array(model["values"](measurements.WheelSpeed(10.2), radar))
+    seen = model["observe"](state, row, model["parameters"](radar))
+    assert seen.innovation == pytest.approx([0.2])
+    assert seen.variance == pytest.approx([0.01])
+    assert seen.jacobian[0, VELOCITY] == pytest.approx(mat_eb(state)[:, 0])
 
 
 def test_the_example_of_a_scenario_is_one() -> None:

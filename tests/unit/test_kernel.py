@@ -17,7 +17,7 @@ import pytest
 
 from fusiond.earth import geodetic
 from fusiond.fusion import Fusion
-from fusiond.kernel import Kernel, Outcome, compiled_available, make_kernel
+from fusiond.kernel import SUSPECT, Kernel, Outcome, compiled_available, make_kernel
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.observe.model import mat_eb
 from fusiond.plan import plan
@@ -249,7 +249,8 @@ def test_reset_after_a_long_rejection(kind: str) -> None:
     first, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
     state.memory[source] = first.history.head.memory[source]  # its innovation; it will be off by as much again
     state.source_stamps[source, [T_LAST, T_REJECTED]] = T0 - 100 * MS
-    for since, resets in ((5 * SECOND, 1), (5 * SECOND - 1, 0), (None, 0)):
+    wait = 5 * SECOND if kind == "position" else SUSPECT * 5 * SECOND
+    for since, resets in ((wait, 1), (wait - 1, 0), (None, 0)):
         state.source_stamps[source, T_ALIKE] = NEVER if since is None else T0 - since
         fusion, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
         assert fusion.history.head.stamps[RESETS] == resets

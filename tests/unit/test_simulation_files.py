@@ -12,7 +12,7 @@ import pytest
 from pymavlink import mavutil
 
 from fusiond import config
-from fusiond.measurements import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, WheelSpeed
+from fusiond.measurements import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, Pressure, WheelSpeed
 from fusiond.simulation.chatter import TELEMETRY_HZ
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import WHEELS, Scenario, load, parse
@@ -48,6 +48,8 @@ no_fix_s = [[5, 6]]
 fault_s = [[8, 9]]
 silent_s = [[10, 11.08]]
 unsigned = false
+[barometer]
+rate_hz = 10
 [[autopilot.reboot]]
 at_s = 40
 """
@@ -100,7 +102,7 @@ def test_readers_decode_the_simulated_events_exactly(noisy: Scenario, written: d
     made = list(simulate(noisy).events())
     assert read == made
     assert {type(event.payload) for event in made} == {
-        ImuSample, GnssPosition, GnssVelocity, WheelSpeed, ClockPair, Invalid,
+        ImuSample, GnssPosition, GnssVelocity, WheelSpeed, Pressure, ClockPair, Invalid,
     }
 
 
@@ -111,7 +113,7 @@ def test_pymavlink_reads_the_tlog(noisy: Scenario, written: dict[str, Path]) -> 
     while (message := log.recv_msg()) is not None:
         found.setdefault(message.get_type(), []).append(message)
     log.close()
-    assert set(found) == {"HIGHRES_IMU", "GPS_RAW_INT", "SYSTEM_TIME", "HEARTBEAT"}
+    assert set(found) == {"HIGHRES_IMU", "GPS_RAW_INT", "SYSTEM_TIME", "HEARTBEAT", "SCALED_PRESSURE"}
     imu, gps = found["HIGHRES_IMU"], found["GPS_RAW_INT"]
     assert [round(m._timestamp * 1e6) for m in imu] == drive.imu.t_receive_us.tolist()
     assert [m.time_usec for m in imu] == drive.imu.time_us.tolist()
