@@ -145,13 +145,17 @@ def one_row(kernel: Kernel, head: FilterState, fusion: Fusion, source: str) -> C
     return run
 
 
-def kernel_lines(repeats: int) -> tuple[list[Line], float]:
-    """The kernel against its twin; and the time of one propagation called from Python [us], the unit of the rewinds."""
+def kernel_lines(repeats: int) -> tuple[list[Line], Callable[[], object]]:
+    """The kernel against its twin; and one propagation called from Python, the unit of the rewinds."""
     fusion, _ = running(200, 3.0)
     fast, twin = make_kernel(fusion.plan, True), make_kernel(fusion.plan, False)
     head = fusion.history.head
     state, other = head.copy(), head.copy()
-    unit = median_us(lambda: fast.propagate(state, 0.005, FORCE_B, RATE_B), repeats, 2000)
+
+    def predict() -> None:
+        fast.propagate(state, 0.005, FORCE_B, RATE_B)
+
+    unit = median_us(predict, repeats, 2000)
     slow = median_us(lambda: twin.propagate(other, 0.005, FORCE_B, RATE_B), repeats, 100)
     lines = [
         Line(
@@ -170,27 +174,30 @@ def kernel_lines(repeats: int) -> tuple[list[Line], float]:
         lines.append(
             Line(f"update: {name}", f"{times[0]:.2f} us", f"NumPy twin {times[1]:.0f} us", f"{times[1] / times[0]:.0f} x")
         )
-    return lines, unit
+    return lines, predict
 
 
 # --- Rewinds
 
 
-def rewind_lines(unit: float, repeats: int) -> list[Line]:
-    """A late fix, whole: placed, restored from a snapshot, everything after it run again, snapshots taken."""
+def rewind_lines(predict: Callable[[], object], repeats: int) -> list[Line]:
+    """A late fix, whole: placed, restored from a snapshot, everything after it run again, snapshots taken. The unit is
+    measured beside each, so that what disturbs the one disturbs the other."""
     lines = []
     for imu_hz in (200, 400):
         for late_ms in (50, 100, 200, 500, 900):
-            rows, times = [], []
+            rows, times, units = [], [], []
             for _ in range(repeats):
                 fusion, now = running(imu_hz, 3.0, horizon_s=1.0)
                 for i in range(5):  # a few at one instant: each is an event more for those after it
                     late = event(now - late_ms * 1_000_000 + i, "gps0.position", 10**6 + i)
                     before, begin = fusion.history.rerun, time.process_time_ns()
                     fusion.take(late)
+                    fusion.history.catch_up()
                     times.append((time.process_time_ns() - begin) / 1000)
                     rows.append(fusion.history.rerun - before)
-            cost, events = statistics.median(times), statistics.median(rows)
+                    units.append(median_us(predict, 1, 200))
+            cost, events, unit = statistics.median(times), statistics.median(rows), statistics.median(units)
             wanted = "<= 100 x" if (imu_hz, late_ms) == (200, 200) else ""
             what = f"fix {late_ms} ms late, IMU {imu_hz} Hz, 4 wheels at 100 Hz: {events:.0f} events"
             lines.append(Line(what, f"{cost:.0f} us", f"one predict {unit:.2f} us", f"{cost / unit:.0f} x", wanted))
@@ -316,8 +323,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    lines, unit = kernel_lines(options.repeats)
-    lines += rewind_lines(unit, options.repeats)
+    lines, predict = kernel_lines(options.repeats)
+    lines += rewind_lines(predict, options.repeats)
     lines += start_lines(options.repeats)
     lines += log_lines(options.minutes, max(1, options.repeats // 2), options.out)
     versions = f"CPU times, medians; fusiond {__version__}, Python {platform.python_version()}, NumPy {np.__version__}"
