@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import platform
 import sys
 import time
@@ -24,11 +25,6 @@ PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the numbe
     "calibration": (calibration.calibration, 20),
     "ferry": (ferry.ferry, 10),
 }
-HEAD = """# The study
-
-How far the estimator can be trusted, by simulated drives whose noise is what the configuration says. Made by
-`make study` (`python -m benchmarks.study`); the numbers below are its output. The same seed gives the same numbers.
-"""
 
 
 def main(arguments: list[str]) -> None:
@@ -40,12 +36,16 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     sections = {}
     for name in options.parts or PARTS:
-        part, runs = PARTS[name]
-        begin = time.perf_counter()
-        sections[name] = part(options.runs or runs, options.seed)
-        print(f"{sections[name].text()}\n({time.perf_counter() - begin:.0f} s)\n", flush=True)
-    about = f"fusiond {__version__}, Python {platform.python_version()}, NumPy {np.__version__}, seed {options.seed}."
-    save(sections, f"{HEAD}\n{about}\n", options.out)
+        part, own_runs = PARTS[name]
+        runs, begin = options.runs or own_runs, time.perf_counter()
+        sections[name] = section = part(runs, options.seed)
+        section.say(
+            f"`python -m benchmarks.study {name} --runs {runs} --seed {options.seed}`: "
+            f"{time.perf_counter() - begin:.0f} s on {os.cpu_count()} processors, "
+            f"fusiond {__version__}, Python {platform.python_version()}, NumPy {np.__version__}."
+        )
+        print(section.text(), flush=True)
+    save(sections, list(PARTS), options.out)
 
 
 if __name__ == "__main__":

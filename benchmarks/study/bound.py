@@ -2,7 +2,8 @@
 
 For a system with additive Gaussian noise Tichavsky, Muravchik, Nehorai (1998), equation 21, is the covariance recursion of
 the Kalman filter with Jacobians at the truth. The transition and its noise are computed here apart from the filter's own;
-the Jacobians of the measurements are the models', which tests hold to finite differences.
+the Jacobians of the measurements are the models', which tests hold to finite differences. The gyro's noise on the lever arms
+counts as noise of the measurement, as if it were another than that which the attitude integrates.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from benchmarks.study.world import WHEEL_PHASE_S, World
 from fusiond.earth import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array
 from fusiond.elementary import square
 from fusiond.observe import CONSTRAINTS, MODELS
+from fusiond.observe.model import Observation, with_rate_noise
 from fusiond.plan import IMU, MODEL, plan
 from fusiond.rotation import quaternion, skew
 from fusiond.sections import Config
@@ -22,9 +24,11 @@ from fusiond.state import (
     ATTITUDE,
     ERROR_SIZE,
     GYRO_BIAS,
+    MEAN_RATE_B,
     POSITION,
     QUATERNION_EB,
     RATE_B,
+    RATE_VARIANCE,
     SCALE,
     VELOCITY,
     VELOCITY_E,
@@ -72,7 +76,8 @@ def carried(p: Array, f: Array, density: Array, dt: float) -> Array:
     return np.asarray(whole @ p @ whole.T + noise * (dt / 6))
 
 
-def updated(p: Array, jacobian: Array, variance: Array) -> Array:
+def updated(p: Array, seen: Observation) -> Array:
+    _, jacobian, variance = seen
     across = p @ jacobian.T
     gain = np.linalg.solve(jacobian @ across + np.diag(variance), across.T).T
     keep = np.eye(len(p)) - gain @ jacobian
@@ -116,25 +121,28 @@ class Bound:
         """The covariance after all measurements of a kind at one instant."""
         world = self.world
         k = min(round(t * world.sensor.rate_hz), len(world.t) - 1)
-        state = true_state(world, k, len(self.plan.sources))
+        state = true_state(world, k, self.plan)
         if what == "wheel":  # beside the IMU's instants
             at = np.array([t])
             kinematics = world.kinematics(at)
             to_n = world.mat_ne[k]
             state.nominal[VELOCITY_E] = to_n.T @ kinematics.velocity_n[0]
             state.nominal[QUATERNION_EB] = quaternion(to_n.T @ kinematics.mat_nb[0])
-            state.auxiliary[RATE_B] = kinematics.rate_nb_b[0] + world.gyro_bias[k]
+            state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = kinematics.rate_nb_b[0] + world.gyro_bias[k]
+        between = t * world.sensor.rate_hz % 1.0 if what == "wheel" else 0.0  # two samples are interpolated
+        density = square(self.plan.imu.gyro_noise) * world.sensor.rate_hz
+        state.auxiliary[RATE_VARIANCE] = density * ((1 - between) ** 2 + between**2)
         state.covariance[:] = p
         if what == "constraint":
             model, parameter = CONSTRAINTS[0], self.plan.constraints[0]
             seen = model.observe(state, parameter, parameter)
-            return p if seen is None else updated(p, seen.jacobian, seen.variance)
+            return p if seen is None else updated(p, with_rate_noise(state, seen))
         for source, number in enumerate(self.plan.models):
             if number == IMU or (number == MODEL["wheel_speed"]) != (what == "wheel"):
                 continue
             seen = MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source])
             assert seen is not None
-            p = updated(p, seen.jacobian, seen.variance)
+            p = updated(p, with_rate_noise(state, seen))
         return p
 
     def row(self, number: int, source: int) -> Array:

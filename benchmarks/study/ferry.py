@@ -8,11 +8,12 @@ import numpy as np
 
 from benchmarks.study import nominal
 from benchmarks.study.report import Section
-from benchmarks.study.runs import Ledger, drive, error, started
+from benchmarks.study.runs import Ledger, drive, error, spread, started
 from benchmarks.study.world import GNSS_NAME, Fault, Sensors, World
 from fusiond.fusion import Fusion
 from fusiond.state import POSITION, RESETS, VELOCITY
 
+IMU_HZ, WHEEL_HZ = 100.0, 20.0
 LOOK_S = 0.5
 ABOARD_S, ASHORE_S = 50.0, 230.0  # the wheels read zero in between
 SPEEDS = {"carried forwards": 6.0, "carried backwards": -6.0, "not carried": 0.0}
@@ -38,7 +39,8 @@ class Passage(NamedTuple):
 def one(speed: float, seed: list[int]) -> Passage:
     random = np.random.default_rng(seed)
     config = nominal.config(motion={"standstill": True}, wheel={"unsigned": True, "least_mps": 0.1})
-    world, fusion = World(nominal.scenario(course=course(speed)), config, random), Fusion(config, compiled=True)
+    scenario = nominal.scenario(course=course(speed), imu_hz=IMU_HZ)
+    world, fusion = World(scenario, config, random), Fusion(config, compiled=True)
     started(fusion, world, random)
     ledger, found = Ledger(fusion), []
 
@@ -48,7 +50,7 @@ def one(speed: float, seed: list[int]) -> Passage:
 
     faults = tuple(Fault(name, "scale", ABOARD_S, ASHORE_S, 0.0) for name in config.wheel)
     looks = np.arange(LOOK_S, world.t[-1], LOOK_S).tolist()
-    drive(fusion, Sensors(world, faults=faults).measurements(), looks, look, ledger)
+    drive(fusion, Sensors(world, WHEEL_HZ, faults=faults).measurements(), looks, look, ledger)
     t, position, velocity = np.array(found).T
     aboard, ashore = (t >= ABOARD_S) & (t < ASHORE_S), t >= ASHORE_S + 10
     rejected = ledger.rejected(f"{GNSS_NAME}.position")[1]
@@ -61,7 +63,7 @@ def ferry(runs: int, seed: int) -> Section:
     section.say(f"{runs} runs each, seed {seed}: aboard for three minutes, GNSS all the time, then drive off.")
     rows = []
     for name, speed in SPEEDS.items():
-        found = [one(speed, [seed, run]) for run in range(runs)]
+        found = spread(one, [(speed, [seed, run]) for run in range(runs)])
         worst = Passage(*(max(values) for values in zip(*found, strict=True)))
         rows.append((name, f"{worst.aboard:.1f} m", f"{worst.velocity:.2f} m/s", f"{worst.ashore:.1f} m",
                      f"{worst.rejected:.1%}", worst.resets))  # fmt: skip

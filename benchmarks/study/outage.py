@@ -8,11 +8,12 @@ import numpy as np
 
 from benchmarks.study import nominal
 from benchmarks.study.report import Section, figure
-from benchmarks.study.runs import Ledger, drive, error, started
+from benchmarks.study.runs import Ledger, drive, error, spread, started
 from benchmarks.study.world import GNSS_NAME, Fault, Sensors, World
 from fusiond.fusion import Fusion
 from fusiond.state import POSITION, RESETS
 
+IMU_HZ, WHEEL_HZ = 100.0, 20.0
 OUTAGES_S = (10.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 BEFORE_S, AFTER_S = 60.0, 20.0
 LOOK_S = 0.5
@@ -35,7 +36,7 @@ def one(seconds: float, seed: list[int]) -> Outage:
     """Run one outage of so many seconds."""
     random, config = np.random.default_rng(seed), nominal.config()
     end = BEFORE_S + seconds
-    scenario = nominal.scenario(int(np.ceil((end + AFTER_S) / 60)))
+    scenario = nominal.scenario(int(np.ceil((end + AFTER_S) / 60)), imu_hz=IMU_HZ)
     world, fusion = World(scenario, config, random), Fusion(config, compiled=True)
     started(fusion, world, random)
     ledger, errors, sigmas = Ledger(fusion), {}, {}
@@ -47,7 +48,7 @@ def one(seconds: float, seed: list[int]) -> Outage:
         sigmas[t] = float(np.sqrt(np.trace((to_n @ head.covariance[POSITION, POSITION] @ to_n.T)[:2, :2])))
 
     faults = (Fault(GNSS_NAME, "absent", BEFORE_S, end - 1e-6),)
-    drive(fusion, Sensors(world, faults=faults).measurements(), looks, look, ledger)
+    drive(fusion, Sensors(world, WHEEL_HZ, faults=faults).measurements(), looks, look, ledger)
     t, rejected = ledger.rejected(f"{GNSS_NAME}.position")
     fused = t[(t >= end - 1e-6) & ~rejected]
     inside = (world.t >= BEFORE_S) & (world.t < end)
@@ -67,7 +68,7 @@ def outage(runs: int, seed: int) -> Section:
     )
     rows, drift = [], []
     for seconds in OUTAGES_S:
-        found = [one(seconds, [seed, run, int(seconds)]) for run in range(runs)]
+        found = spread(one, [(seconds, [seed, run, int(seconds)]) for run in range(runs)])
         share = np.array([100 * o.error / o.driven for o in found])
         drift.append(share)
         rms = float(np.sqrt(np.mean([o.error**2 for o in found])))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+TITLE = "# The study\n"
 WIDTH_IN, HEIGHT_IN, DPI = 7.2, 2.6, 80
 
 
@@ -49,21 +50,18 @@ def figure(columns: int = 1) -> tuple[Any, Any]:
     return made, axes
 
 
-def save(sections: dict[str, Section], head: str, folder: Path) -> None:
-    """Write study.md and images/study/*.png below a folder; sections of earlier runs that are not in this one stay."""
+def save(sections: dict[str, Section], order: Sequence[str], folder: Path) -> None:
+    """Write the sections into study.md and images/study/*.png below a folder. What stands before the first section, and the
+    sections that are not in this run, stay."""
     page = folder / "study.md"
-    parts = dict(_earlier(page.read_text(encoding="utf-8"))) if page.is_file() else {}
+    head, *pieces = re.split(r"<!-- part: (\w+) -->\n", page.read_text(encoding="utf-8") if page.is_file() else TITLE)
+    parts = dict(zip(pieces[::2], pieces[1::2], strict=True))
     parts |= {name: section.text() for name, section in sections.items()}
-    body = "\n".join(f"<!-- part: {name} -->\n{text.rstrip()}\n" for name, text in parts.items())
+    body = "\n".join(f"<!-- part: {name} -->\n{parts[name].rstrip()}\n" for name in order if name in parts)
     folder.mkdir(parents=True, exist_ok=True)
-    page.write_text(f"{head}\n{body}", encoding="utf-8")
+    page.write_text(f"{head.rstrip()}\n\n{body}", encoding="utf-8")
     for section in sections.values():
         for name, made in section.pictures.items():
             target = folder / "images" / "study" / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             made.savefig(target)
-
-
-def _earlier(text: str) -> list[tuple[str, str]]:
-    pieces = re.split(r"<!-- part: (\w+) -->\n", text)
-    return list(zip(pieces[1::2], pieces[2::2], strict=True))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +15,20 @@ from fusiond.earth import Array
 from fusiond.fusion import Fusion
 from fusiond.kernel import Outcome, Rows
 from fusiond.measurements import Measurement
+from fusiond.motion import watch
 from fusiond.plan import Plan, nanoseconds
 from fusiond.rotation import matrix, quaternion, quaternion_exp, quaternion_multiply
 from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
     ATTITUDE,
-    ERROR_SIZE,
+    CALIBRATIONS,
     FORCE_B,
     GYRO_BIAS,
     GYRO_BIAS_B,
     HELD_FORCE_B,
     HELD_RATE_B,
-    MOUNT,
+    MEAN_RATE_B,
     MOUNT_ERROR,
     PHASE,
     POSITION,
@@ -39,7 +43,6 @@ from fusiond.state import (
     T_START,
     VELOCITY,
     VELOCITY_E,
-    WHEEL_SCALE,
     FilterState,
     T,
 )
@@ -54,59 +57,66 @@ BLOCKS = {
     "mount": MOUNT_ERROR,
 }
 COLLECT_EVERY = 20  # inertial samples
+Result = TypeVar("Result")
 SETTLED_NS = SECOND // 2  # nothing is later than this in these drives
 START_POSITION, START_VELOCITY = 2.0, 0.3  # m, m/s: sigmas per axis of a start from the truth
 
 
+def spread(work: Callable[..., Result], jobs: Sequence[tuple[Any, ...]]) -> list[Result]:
+    """work(*job) for each of the jobs, in their order, on all processors; work, jobs and results must be picklable."""
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, *zip(*jobs, strict=True)))
+
+
 def start_covariance(world: World, plan: Plan) -> Array:
     """The covariance (n, n) of a start from the truth."""
-    unit, settings = plan.imu, plan.filter
-    level, heading = np.radians([settings.level_sigma_deg, settings.heading_sigma_deg])
-    sigmas = np.zeros(ERROR_SIZE)
+    unit = plan.imu
+    level, heading = np.radians([plan.filter.level_sigma_deg, plan.filter.heading_sigma_deg])
+    sigmas = np.zeros(plan.size)
     for block, sigma in (
         (POSITION, START_POSITION),
         (VELOCITY, START_VELOCITY),
         (GYRO_BIAS, unit.gyro_bias_sigma),
         (ACCEL_BIAS, unit.accel_bias_sigma),
-        (SCALE, settings.wheel_scale_sigma),
-        (MOUNT_ERROR, np.radians(settings.mount_sigma_deg)),
     ):
         sigmas[block] = sigma
+    sigmas[CALIBRATIONS:] = np.sqrt(plan.calibration_variances)
     covariance = np.diag(sigmas**2)
     to_n = world.mat_ne[0]
     covariance[ATTITUDE, ATTITUDE] = to_n.T @ np.diag([level**2, level**2, heading**2]) @ to_n
     return covariance
 
 
-def true_state(world: World, k: int, sources: int) -> FilterState:
+def true_state(world: World, k: int, plan: Plan) -> FilterState:
     """A filter state that holds the truth at the IMU's k-th instant."""
-    state = FilterState(sources)
+    state = FilterState(len(plan.sources), plan.size)
     x = state.nominal
     x[POSITION_E], x[VELOCITY_E] = world.position_e[k], world.velocity_e[k]
     x[QUATERNION_EB] = quaternion(world.mat_eb[k])
     x[GYRO_BIAS_B], x[ACCEL_BIAS_B] = world.gyro_bias[k], world.accel_bias[k]
-    x[WHEEL_SCALE], x[MOUNT] = world.scale[k], world.drawn.mount
-    state.auxiliary[RATE_B] = world.rate_b[k] + world.gyro_bias[k]
+    x[CALIBRATIONS + 1 : plan.size + 1] = world.calibrations[k, : plan.size - CALIBRATIONS]
+    state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = world.rate_b[k] + world.gyro_bias[k]
     state.auxiliary[FORCE_B] = world.force_b[k] + world.accel_bias[k]
     return state
 
 
 def started(fusion: Fusion, world: World, random: np.random.Generator) -> None:
-    """Make the filter run from the first instant on: off the truth by one draw of `start_covariance`. Mount and scale were
+    """Make the filter run from the first instant on: off the truth by one draw of `start_covariance`. Calibrations were
     drawn with the world, so their estimates start at nothing."""
-    state = true_state(world, 0, len(fusion.plan.sources))
+    state = true_state(world, 0, fusion.plan)
     covariance = start_covariance(world, fusion.plan)
-    off = np.linalg.cholesky(covariance + 1e-30 * np.eye(ERROR_SIZE)) @ random.standard_normal(ERROR_SIZE)
+    off = np.linalg.cholesky(covariance + 1e-30 * np.eye(len(covariance))) @ random.standard_normal(len(covariance))
     x = state.nominal
     x[POSITION_E] -= off[POSITION]
     x[VELOCITY_E] -= off[VELOCITY]
     x[QUATERNION_EB] = quaternion_multiply(quaternion_exp(-off[ATTITUDE]), x[QUATERNION_EB])
     x[GYRO_BIAS_B] = x[ACCEL_BIAS_B] = 0.0  # drawn with the world too
-    x[WHEEL_SCALE] = x[MOUNT] = 0.0
+    x[CALIBRATIONS + 1 :] = 0.0
     state.covariance[:] = covariance
     state.auxiliary[HELD_FORCE_B] = state.auxiliary[FORCE_B] = world.accel[0]
     state.auxiliary[HELD_RATE_B] = state.auxiliary[RATE_B] = world.gyro[0]
     state.stamps[[T, T_IMU, T_CONSTRAINT, T_POSITION, T_START]] = T0
+    watch(state, world.accel[0], world.gyro[0], 1 / world.sensor.rate_hz, fusion.plan)
     state.stamps[PHASE] = RUNNING
     history = fusion.history
     history.head.copy_from(state)
@@ -115,14 +125,14 @@ def started(fusion: Fusion, world: World, random: np.random.Generator) -> None:
 
 def error(state: FilterState, world: World, k: int) -> Array:
     """Error (n,) of a state at the IMU's k-th instant: true = estimate (+) error."""
-    x, found = state.nominal, np.zeros(ERROR_SIZE)
+    x, found = state.nominal, np.zeros(state.size)
     found[POSITION], found[VELOCITY] = world.position_e[k] - x[POSITION_E], world.velocity_e[k] - x[VELOCITY_E]
     turn = world.mat_eb[k] @ matrix(x[QUATERNION_EB]).T
     axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     sine, cosine = float(np.linalg.norm(axis)), (float(np.trace(turn)) - 1) / 2
     found[ATTITUDE] = axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
     found[GYRO_BIAS], found[ACCEL_BIAS] = world.gyro_bias[k] - x[GYRO_BIAS_B], world.accel_bias[k] - x[ACCEL_BIAS_B]
-    found[SCALE], found[MOUNT_ERROR] = world.scale[k] - x[WHEEL_SCALE], world.drawn.mount - x[MOUNT]
+    found[CALIBRATIONS:] = world.calibrations[k, : state.size - CALIBRATIONS] - x[CALIBRATIONS + 1 : state.size + 1]
     return found
 
 

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 from fusiond.earth import ECCENTRICITY2, Array
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
-from fusiond.sections import Config, Wheel
+from fusiond.plan import plan, scale_state
+from fusiond.sections import Config, Wheel, wheel_groups
 from fusiond.simulation import imu as inertial_sensor
 from fusiond.simulation import wgs84
 from fusiond.simulation.gnss import gauss_markov
 from fusiond.simulation.scenario import Imu, Scenario
 from fusiond.simulation.trajectory import Kinematics, Trajectory, blend, turned
 from fusiond.simulation.truth import Motion, inertial
+from fusiond.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
 
 SECOND = 1_000_000_000  # ns
 T0 = 1_760_000_000 * SECOND
@@ -37,8 +39,23 @@ IMU_NAME, GNSS_NAME = "imu0", "gps0"
 class Drawn:
     """What chance decides before the drive."""
 
-    mount: Array  # (2,) rad: pitch and yaw of the IMU against the vehicle
-    scale: float  # what every wheel reads too much
+    calibrations: Array  # (WIDE_SIZE - CALIBRATIONS,): the truth of the error states of the installation, as they lie there
+
+    @property
+    def mount(self) -> Array:
+        """Pitch and yaw (2,) [rad] of the IMU against the vehicle."""
+        return self.calibrations[MOUNT_ERROR.start - CALIBRATIONS : MOUNT_ERROR.stop - CALIBRATIONS]
+
+    @property
+    def antenna(self) -> Array:
+        """What the lever arm (3,) [m] is more than configured."""
+        return self.calibrations[ANTENNA_ERROR.start - CALIBRATIONS : ANTENNA_ERROR.stop - CALIBRATIONS]
+
+    @property
+    def delays(self) -> tuple[float, float]:
+        """How long before its stamp a GNSS position was true, and the velocity [s]."""
+        position, more = self.calibrations[DELAYS_ERROR.start - CALIBRATIONS : DELAYS_ERROR.stop - CALIBRATIONS]
+        return float(position), float(position + more)
 
 
 class World:
@@ -46,12 +63,12 @@ class World:
 
     def __init__(self, scenario: Scenario, config: Config, random: np.random.Generator, slip: bool = True) -> None:
         """`slip`: whether the vehicle slips as configured, or not at all."""
-        settings, motion = config.filter, config.motion
+        motion = config.motion
         self.config, self.random = config, random
-        self.drawn = Drawn(
-            np.radians(settings.mount_sigma_deg) * random.standard_normal(2),
-            float(settings.wheel_scale_sigma * random.standard_normal()),
-        )
+        first = np.zeros(WIDE_SIZE - CALIBRATIONS)
+        variances = plan(config).calibration_variances
+        first[: len(variances)] = np.sqrt(variances)
+        self.drawn = Drawn(first * random.standard_normal(len(first)))
         (unit,) = config.imu.values()
         mount = (0.0, float(np.degrees(self.drawn.mount[0])), float(np.degrees(self.drawn.mount[1])))
         noise = {key: getattr(unit, key) for key in IMU_KEYS}
@@ -135,7 +152,11 @@ class World:
         self.gyro, self.accel, self.gyro_bias, self.accel_bias = sensed
         settings = self.config.filter
         walk = settings.wheel_scale_walk / np.sqrt(self.sensor.rate_hz) if settings.wheel_scale_sigma else 0.0
-        self.scale = self.drawn.scale + np.cumsum(walk * self.random.standard_normal(len(self.t)))
+        self.groups = wheel_groups(self.config)
+        states = {scale_state(group) for group in {0, *self.groups.values()}}
+        self.calibrations = np.tile(self.drawn.calibrations, (len(self.t), 1))  # and as they walk
+        for state in sorted(states):
+            self.calibrations[:, state - CALIBRATIONS] += np.cumsum(walk * self.random.standard_normal(len(self.t)))
 
     def times(self, interval: float, phase: float) -> Array:
         """Regular instants inside the drive [s]."""
@@ -171,9 +192,9 @@ def ecef(latitude: Array, longitude: Array, height: Array) -> Array:
 class Fault:
     """What goes wrong with a source, in [start, stop) seconds.
 
-    scale: readings times `size` (a wheel slips). jump: the position `size` m to the north. drift: it leaves at `size` m/s
-    to the north, and the velocity says the same. stuck: the last good message again and again. absent: none. noisy: white
-    noise of `size` configured sigmas on top. silent wheels read 0 with kind scale and size 0.
+    scale: readings times `size` (a wheel slips; 0: it is silent). jump: the position `size` m to the north. drift: it
+    leaves at `size` m/s to the north, and the velocity says the same. creep: likewise, but the velocity stays right.
+    stuck: the last good message again and again. absent: none. noisy: white noise of `size` configured sigmas on top.
     """
 
     source: str
@@ -206,9 +227,9 @@ class Sensors:
         for name in self.config.gnss:
             self._gnss(found, name, gnss_from)
         t = world.times(1 / self.wheel_hz, WHEEL_PHASE_S)
-        scale = 1 + np.interp(t, world.t, world.scale)
         for name, wheel in self.config.wheel.items():
             noise = self._alike(len(t), 1 / self.wheel_hz, wheel.correlation_s)[:, 0]
+            scale = 1 + np.interp(t, world.t, world.calibrations[:, scale_state(world.groups[name]) - CALIBRATIONS])
             speed = world.wheel_speed(wheel, t)
             turning = (np.abs(speed) >= wheel.least_mps) & (speed != 0)
             readings = np.where(turning, scale * speed + wheel.sigma_mps * noise, 0.0)
@@ -240,32 +261,40 @@ class Sensors:
     def _gnss(self, found: list[Measurement], name: str, begin: float) -> None:
         world, gnss = self.world, self.config.gnss[name]
         t = world.times(gnss.interval_s, 0.0)
-        t = t[t >= begin - 1e-9]
-        kinematics, lever = world.kinematics(t), np.array(gnss.lever_arm_m)
-        sigma = np.array([gnss.position_sigma_m, gnss.position_sigma_m, gnss.height_sigma_m])
-        off = turned(kinematics.mat_nb, np.broadcast_to(lever, (len(t), 3)))
-        errors = self._alike(len(t), gnss.interval_s, gnss.position_correlation_s) * sigma
-        swing = turned(kinematics.mat_nb, np.cross(kinematics.rate_nb_b, lever))
-        noise = self._alike(len(t), gnss.interval_s, gnss.velocity_correlation_s) * gnss.velocity_sigma_mps
-        velocity = kinematics.velocity_n + swing + noise
+        delay, velocity_delay = world.drawn.delays
+        t = t[t >= max(begin - 1e-9, delay, velocity_delay)]
+        errors, off = self._errors(name, t)
         index: NDArray[np.int64] = np.arange(len(t))
         for fault in self._of(name):
             inside = (t >= fault.start) & (t < fault.stop)
             if fault.kind == "jump":
                 errors[inside, 0] += fault.size
-            elif fault.kind == "drift":
+            elif fault.kind in ("drift", "creep"):
                 errors[inside, 0] += fault.size * (t[inside] - fault.start)
-                velocity[inside, 0] += fault.size
+                off[inside, 0] += fault.size if fault.kind == "drift" else 0.0
             elif fault.kind == "noisy":
+                sigma = np.array([gnss.position_sigma_m, gnss.position_sigma_m, gnss.height_sigma_m])
                 errors += inside[:, None] * fault.size * sigma * self.random.standard_normal((len(t), 3))
             elif fault.kind == "stuck":
                 index = held(t, inside)
-        latitude, longitude, height = (part[index].tolist() for part in wgs84.shifted(*world.place(t), off + errors))
+        lever = np.array(gnss.lever_arm_m) + world.drawn.antenna
+        mat_nb = world.kinematics(t - delay).mat_nb
+        antenna = turned(mat_nb, np.broadcast_to(lever, (len(t), 3))) + errors
+        latitude, longitude, height = (part[index].tolist() for part in wgs84.shifted(*world.place(t - delay), antenna))
         places = [GnssPosition(*place) for place in zip(latitude, longitude, height, strict=True)]
         self._add(found, f"{name}.position", t, places, self.gnss_latency_s, fault_of=name)
         if gnss.use_velocity:
-            velocities = [GnssVelocity(*v) for v in velocity[index].tolist()]
+            kinematics = world.kinematics(t - velocity_delay)
+            swing = turned(kinematics.mat_nb, np.cross(kinematics.rate_nb_b, lever))
+            velocities = [GnssVelocity(*v) for v in (kinematics.velocity_n + swing + off)[index].tolist()]
             self._add(found, f"{name}.velocity", t, velocities, self.gnss_latency_s, fault_of=name)
+
+    def _errors(self, name: str, t: Array) -> tuple[Array, Array]:
+        """Of a receiver's positions (N, 3) [m] and velocities (N, 3) [m/s], north-east-down."""
+        gnss = self.config.gnss[name]
+        sigma = np.array([gnss.position_sigma_m, gnss.position_sigma_m, gnss.height_sigma_m])
+        position = self._alike(len(t), gnss.interval_s, gnss.position_correlation_s) * sigma
+        return position, self._alike(len(t), gnss.interval_s, gnss.velocity_correlation_s) * gnss.velocity_sigma_mps
 
     def _add(
         self,
