@@ -911,6 +911,30 @@ cdef void difference(double* a, double* b, double* error) noexcept nogil:
         error[ATTITUDE + i] = turn[1 + i] * (2.0 if turn[0] >= 0 else -2.0)
 
 
+cdef void turn_along(double* p, double* error) noexcept nogil:
+    """fusiond.update.turn_along"""
+    cdef double rows[6 * n]
+    cdef double* e
+    cdef double* a = p + ATTITUDE * n
+    cdef int block, i, j
+    for block in range(2):
+        e = error + 3 * block  # of position, then of velocity
+        for j in range(n):
+            rows[(3 * block) * n + j] = e[1] * a[2 * n + j] - e[2] * a[n + j]
+            rows[(3 * block + 1) * n + j] = e[2] * a[j] - e[0] * a[2 * n + j]
+            rows[(3 * block + 2) * n + j] = e[0] * a[n + j] - e[1] * a[j]
+    for i in range(6):
+        axpy(p + i * n, -1.0, rows + i * n)
+    for i in range(n):
+        a = p + i * n + ATTITUDE
+        for block in range(2):
+            e = error + 3 * block
+            p[i * n + 3 * block] -= e[1] * a[2] - e[2] * a[1]
+            p[i * n + 3 * block + 1] -= e[2] * a[0] - e[0] * a[2]
+            p[i * n + 3 * block + 2] -= e[0] * a[1] - e[1] * a[0]
+    mirror(p)
+
+
 cdef struct Update:
     double ratio
     bint fused
@@ -1026,6 +1050,7 @@ cdef Update update(double* x, double* p, Observation* seen, double gate, double 
                 p[i * n + j] = share * p[i * n + j] + (1 - share) * before[i * n + j] + mixed * (error[i] * error[j])
         for i in range(n):
             error[i] = share * error[i]
+    turn_along(p, error)
     inject(x, error)
     result.fused = share >= 0.5
     return result

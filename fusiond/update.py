@@ -9,7 +9,7 @@ import numpy as np
 from fusiond.earth import Array
 from fusiond.elementary import exp
 from fusiond.observe.model import Observation
-from fusiond.rotation import normalised, quaternion_exp, quaternion_multiply
+from fusiond.rotation import normalised, quaternion_exp, quaternion_multiply, skew
 from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
@@ -149,8 +149,25 @@ def update(
         covariance = share * covariance + (1 - share) * state.covariance + share * (1 - share) * np.outer(error, error)
         error = share * error
     state.covariance[:] = (covariance + covariance.T) / 2
+    turn_along(state.covariance, error)
     inject(state, error)
     return ratio, share >= 0.5
+
+
+def turn_along(covariance: Array, error: Array) -> None:
+    """Let an attitude error turn the corrections of position and velocity along: P = M P M' with -[correction]x in M's
+    blocks of position and velocity by attitude, for a correction (n,).
+
+    So the error is that of an invariant filter (Barrau and Bonnabel 2017), true velocity = exp([phi]x) velocity + error: a
+    heading that nothing tells of stays as uncertain as it is. Without this each correction of the velocity would turn the
+    direction in which the heading cannot be seen, and the filter would take that for knowledge.
+    """
+    for block in (POSITION, VELOCITY):
+        covariance[block] -= skew(error[block]) @ covariance[ATTITUDE]
+    for block in (POSITION, VELOCITY):
+        covariance[:, block] -= covariance[:, ATTITUDE] @ skew(error[block]).T
+    upper = np.triu(covariance)
+    covariance[:] = upper + np.triu(covariance, 1).T
 
 
 def detection(distance: float, m: int, clutter: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 
@@ -161,3 +162,19 @@ def test_quiet_drive_without_wheels_is_no_standstill(compiled: bool) -> None:
     assert not stands(fusion)  # it feels like standstill, and the velocity denies it
     assert np.abs(head.nominal[GYRO_BIAS_B]).max() < 1e-4
     assert fusion.totals()["REJECTED"] == 0
+
+
+@needs_compiled
+def test_wheels_do_not_tell_the_heading() -> None:
+    """Without GNSS nothing tells it: an error of the heading turns velocity and path along, and its sigma never shrinks."""
+    truth = drive(90.0, lambda t: 12.0 + 3.0 * np.sin(0.2 * t), lambda t: 0.4 + 0.3 * np.sin(0.1 * t), rate=50.0)
+    events = [event for event in measurements(truth) if not event.source.startswith("gps0")]
+    first = [event for event in measurements(truth) if event.source.startswith("gps0") and event.t_ns < T0 + 2 * SECOND]
+    fusion, sigmas = Fusion(config(filter=FACING | {"heading_sigma_deg": 5.0})), []
+    for event in sorted(events + first, key=lambda event: event.key):
+        fusion.take(event)
+        if event.source == "imu0" and event.sequence % 500 == 0 and event.t_ns > T0 + 4 * SECOND:
+            state = fusion.estimate_at(event.t_ns).state
+            assert state is not None
+            sigmas.append(math.degrees(state.sigma_yaw()))
+    assert all(later > 0.95 * earlier for earlier, later in itertools.pairwise(sigmas))  # but for the second order
