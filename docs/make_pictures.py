@@ -260,11 +260,11 @@ def draw_bank() -> None:
 
     def look(run: Replay, message: StateMessage) -> tuple[float, ...]:
         """The one yaw and its sigma; before that not a number, and weight and yaw of each hypothesis that is left."""
-        head = run.fusion.history.head
+        head, kernel = run.fusion.history.head, run.fusion.history.kernel
         if message.state:
             return message.state.yaw_deg % 360, message.state.sigma_yaw_deg
         left = alive(head) if head.stamps[PHASE] == CHOOSING else []
-        yaws = (math.degrees(state_estimate(head.hypothesis(i)).euler()[2]) % 360 for i in left)
+        yaws = (math.degrees(state_estimate(head.hypothesis(i), kernel).euler()[2]) % 360 for i in left)
         return (math.nan, *(number for i, yaw in zip(left, yaws, strict=True) for number in (float(head.bank[i, 0]), yaw)))
 
     second, looks, truth = seen(REVERSES, look)

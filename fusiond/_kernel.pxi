@@ -9,10 +9,12 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memmove, memset
 
 from fusiond import state as layout
-from fusiond import alignment, bank, health, kernel, motion, observe, strapdown, update as updates
+from fusiond import answer as answers
+from fusiond import alignment, bank, elementary, health, kernel, measure, motion, observe, strapdown, update as updates
 from fusiond.earth import GRAVITY_RATIO as _GRAVITY_RATIO
 from fusiond.kernel import Outcome
 from fusiond.observe import wheel_speed
+from numpy import empty
 
 cdef enum:
     VALUES = 8
@@ -59,6 +61,7 @@ cdef enum:
     SCALE = 15
     MOUNT_ERROR = 16
     CALIBRATIONS = 15
+    ANSWER_SIZE = 91
     ANTENNA_ERROR = 21  # from here on only in the wide state
     DELAYS_ERROR = 24
     WIDE_SIZE = 27
@@ -160,10 +163,10 @@ cdef int64_t GNSS_FRESH_NS = motion.GNSS_FRESH_NS
 cdef double CARRIED = motion.CARRIED
 cdef double UNIFORM = updates.UNIFORM
 cdef double NEGLIGIBLE = updates.NEGLIGIBLE
-cdef int64_t BREAK_NS = kernel.BREAK_NS
-cdef int64_t OUTAGE_NS = kernel.OUTAGE_NS
-cdef int64_t SUSPECT = kernel.SUSPECT
-cdef double NEAR = kernel.NEAR
+cdef int64_t BREAK_NS = measure.BREAK_NS
+cdef int64_t OUTAGE_NS = measure.OUTAGE_NS
+cdef int64_t SUSPECT = measure.SUSPECT
+cdef double NEAR = measure.NEAR
 cdef int64_t JUDGE_NS = health.JUDGE_NS
 cdef double KEEPS = health.KEEPS
 cdef double PRIOR[4]
@@ -190,6 +193,12 @@ cdef double NOISE_TIME = health.NOISE_TIME
 cdef double CLIPPED = health.CLIPPED
 cdef double INTERVAL_SHARE = health.INTERVAL_SHARE
 cdef double NIS_TIME = health.NIS_TIME
+cdef double PI = 3.141592653589793
+cdef double PI_LOW = elementary.PI_LOW
+cdef double HALF_PI_HIGH = elementary.HALF_PI_HIGH
+cdef double HALF_PI_LOW = elementary.HALF_PI_LOW
+cdef double ATAN[11]
+ATAN[:] = elementary.ATAN
 
 
 def check_layout():
@@ -224,6 +233,7 @@ def check_layout():
         ("CLUTTER", CLUTTER), ("PARAMETERS", PARAMETERS), ("VALUES", VALUES),
     ):
         assert getattr(observe.model, name) == number, name
+    assert answers.ANSWER_SIZE == ANSWER_SIZE
     assert (Outcome.FUSED, Outcome.REJECTED) == (FUSED, REJECTED)
     assert (Outcome.DUPLICATE, Outcome.WAITING) == (DUPLICATE, WAITING)
 
@@ -277,6 +287,39 @@ cdef double exponential(double x) noexcept nogil:
         6.61375632143793436117e-05 + t * (-1.65339022054652515390e-06 + t * 4.13813679705723846039e-08))))
     cdef double y = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
     return ldexp(y, <int>k)
+
+
+cdef double arc_tangent(double x) noexcept nogil:
+    """Of x >= 0."""
+    cdef double high, low, u, z, w, odd, even
+    if x < 0.4375:
+        high, low, u = 0.0, 0.0, x
+    elif x < 0.6875:
+        high, low, u = 4.63647609000806093515e-01, 2.26987774529616870924e-17, (2.0 * x - 1.0) / (2.0 + x)
+    elif x < 1.1875:
+        high, low, u = 7.85398163397448278999e-01, 3.06161699786838301793e-17, (x - 1.0) / (x + 1.0)
+    elif x < 2.4375:
+        high, low, u = 9.82793723247329054082e-01, 1.39033110312309984516e-17, (x - 1.5) / (1.0 + 1.5 * x)
+    else:
+        high, low, u = 1.57079632679489655800, 6.12323399573676603587e-17, -1.0 / x
+    z = u * u
+    w = z * z
+    odd = z * (ATAN[0] + w * (ATAN[2] + w * (ATAN[4] + w * (ATAN[6] + w * (ATAN[8] + w * ATAN[10])))))
+    even = w * (ATAN[1] + w * (ATAN[3] + w * (ATAN[5] + w * (ATAN[7] + w * ATAN[9]))))
+    return high - ((u * (odd + even) - low) - u)
+
+
+cdef double atan2(double y, double x) noexcept nogil:
+    cdef double angle
+    if x == 0.0 and y == 0.0:
+        return 0.0
+    if x == 0.0:
+        angle = HALF_PI_HIGH + HALF_PI_LOW
+    else:
+        angle = arc_tangent(fabs(y) / fabs(x))
+    if x < 0.0:
+        angle = PI - (angle - PI_LOW)
+    return -angle if y < 0.0 else angle
 
 
 # ---------------------------------------------------------------- rotations and earth (fusiond.rotation, fusiond.earth)
@@ -1174,6 +1217,58 @@ cdef bint moved(double* memory, Observation* seen, double gate) noexcept nogil:
 
 # ---------------------------------------------------------------- the loop (fusiond.kernel, fusiond.motion)
 
+# ---------------------------------------------------------------- what is published (fusiond.answer)
+
+cdef void quaternion_of(double* m, double* q) noexcept nogil:
+    cdef double trace = m[0] + m[4] + m[8], most = trace
+    cdef int pick = 0, i
+    for i in range(3):
+        if m[4 * i] > most:
+            most = m[4 * i]
+            pick = i + 1
+    if pick == 0:
+        q[0], q[1], q[2], q[3] = 1 + trace, m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    elif pick == 1:
+        q[0], q[1], q[2], q[3] = m[7] - m[5], 1 + 2 * m[0] - trace, m[1] + m[3], m[2] + m[6]
+    elif pick == 2:
+        q[0], q[1], q[2], q[3] = m[2] - m[6], m[1] + m[3], 1 + 2 * m[4] - trace, m[5] + m[7]
+    else:
+        q[0], q[1], q[2], q[3] = m[3] - m[1], m[2] + m[6], m[5] + m[7], 1 + 2 * m[8] - trace
+    if not q[0] >= 0:
+        for i in range(4):
+            q[i] = -q[i]
+    normalise(q)
+
+
+cdef void answer(double* x, double* p, double* found) noexcept nogil:
+    cdef double sa, ca, so, co
+    cdef double to_n[9]
+    cdef double c[9]
+    cdef double turned[9]
+    cdef double* out
+    cdef int a, b, i, j
+    geodetic_trig(x + POSITION_E, &sa, &ca, &so, &co)
+    found[0] = atan2(sa, ca)
+    found[1] = atan2(so, co)
+    found[2] = height_of(x + POSITION_E, sa, ca)
+    mat_ne(x + POSITION_E, to_n)
+    times(to_n, x + VELOCITY_E, found + 3)
+    matrix(x + QUATERNION_EB, c)
+    matrix_product(to_n, c, turned)
+    quaternion_of(turned, found + 6)
+    for a in range(3):
+        for b in range(3):
+            for i in range(3):  # one block of the covariance, turned from both sides
+                for j in range(3):
+                    turned[3 * i + j] = to_n[3 * i] * p[3 * a * n + 3 * b + j] + \
+                        to_n[3 * i + 1] * p[(3 * a + 1) * n + 3 * b + j] + to_n[3 * i + 2] * p[(3 * a + 2) * n + 3 * b + j]
+            out = found + 10 + 27 * a + 3 * b
+            for i in range(3):
+                for j in range(3):
+                    out[9 * i + j] = turned[3 * i] * to_n[3 * j] + turned[3 * i + 1] * to_n[3 * j + 1] + \
+                        turned[3 * i + 2] * to_n[3 * j + 2]
+
+
 cdef class Kernel:
     """The compiled counterpart of fusiond.kernel.Kernel, for one plan."""
 
@@ -1275,6 +1370,14 @@ cdef class Kernel:
         if t_ns > carried:
             coast(self.x, self.p, (t_ns - carried) * 1e-9, &self.noise)
         self.stamps[T] = t_ns
+
+    def answer(self, double[::1] nominal, double[:, ::1] covariance):
+        """fusiond.answer.answer"""
+        if nominal.shape[0] != NOMINAL_SIZE or covariance.shape[0] != n or covariance.shape[1] != n:
+            raise ValueError(f"a state of {n} error states is needed, not {covariance.shape[0]}")
+        cdef double[::1] found = empty(ANSWER_SIZE)
+        answer(&nominal[0], &covariance[0, 0], &found[0])
+        return found.base
 
     def attach(self, head, Row[::1] table, int64_t[:, ::1] counts, double[:, ::1] kept_numbers,
                int64_t[:, ::1] kept_whole, int64_t[::1] kept_applied):

@@ -7,26 +7,23 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from msgspec import Struct
 
+from fusiond.answer import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
 from fusiond.clock import Clock
-from fusiond.earth import Array, geodetic, mat_ne
-from fusiond.estimate import Estimate, Mode, StateEstimate
+from fusiond.estimate import COVARIANCE_SIZE, Estimate, Mode, StateEstimate
 from fusiond.health import Belief, belief
 from fusiond.history import History
 from fusiond.hot_start import Verdict, decided, leading, leads
-from fusiond.kernel import Outcome
-from fusiond.measurements import ImuSample, Invalid, Measurement, Received
+from fusiond.kernel import AnyKernel, Outcome
+from fusiond.measurements import ImuSample, Invalid, Measurement, Received, Vector3
 from fusiond.observe import MODELS
 from fusiond.observe.model import Unusable, within
 from fusiond.plan import IMU, SECOND, nanoseconds, plan, section_of
-from fusiond.rotation import matrix, product, quaternion
 from fusiond.sections import Config, Imu
 from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
-    ATTITUDE,
     FORCE_B,
     GYRO_BIAS,
     GYRO_BIAS_B,
@@ -35,9 +32,6 @@ from fusiond.state import (
     MOUNT_ERROR,
     NEVER,
     PHASE,
-    POSITION,
-    POSITION_E,
-    QUATERNION_EB,
     RATE_B,
     RESETS,
     RUNNING,
@@ -45,8 +39,6 @@ from fusiond.state import (
     T_IMU,
     T_POSITION,
     T_START,
-    VELOCITY,
-    VELOCITY_E,
     WHEEL_SCALE,
     FilterState,
     T,
@@ -176,7 +168,7 @@ class Fusion:
         age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
         if stamps[PHASE] != RUNNING:
             return Estimate(t_ns, Mode.ALIGNING, age, resets, None)
-        answer = state_estimate(state)
+        answer = state_estimate(state, self.history.kernel)
         north, east, _ = answer.sigma_position_n()
         mode = Mode.NOMINAL
         if math.hypot(north, east) > self.plan.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
@@ -193,34 +185,34 @@ def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
     return sample.specific_force_b + sample.angular_rate_b
 
 
-def state_estimate(state: FilterState) -> StateEstimate:
+def state_estimate(state: FilterState, kernel: AnyKernel) -> StateEstimate:
     """A running filter state in north-east-down, as it is published."""
-    x, covariance = state.nominal, state.covariance
-    latitude, longitude, height = geodetic(x[POSITION_E])
-    to_n = mat_ne(x[POSITION_E])
-    turn = np.zeros((ATTITUDE.stop, ATTITUDE.stop))
-    for block in (POSITION, VELOCITY, ATTITUDE):
-        turn[block, block] = to_n
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    x, auxiliary = state.nominal, state.auxiliary
+    numbers = kernel.answer(x, state.covariance)
+    told, nominal = numbers[: COVARIANCE_N.start].tolist(), x.tolist()
+    rate, force = auxiliary[RATE_B].tolist(), auxiliary[FORCE_B].tolist()
+    gyro_bias, accel_bias = nominal[GYRO_BIAS_B], nominal[ACCEL_BIAS_B]
+    sigma = [math.sqrt(max(variance, 0.0)) for variance in state.covariance.diagonal().tolist()]
     return StateEstimate(
-        latitude=latitude,
-        longitude=longitude,
-        height=height,
-        velocity_n=_three(product(to_n, x[VELOCITY_E])),
-        quaternion_nb=tuple(float(c) for c in quaternion(product(to_n, matrix(x[QUATERNION_EB])))),  # type: ignore[arg-type]
-        angular_rate_b=_three(state.auxiliary[RATE_B] - x[GYRO_BIAS_B]),
-        acceleration_b=_three(state.auxiliary[FORCE_B] - x[ACCEL_BIAS_B]),
-        gyro_bias=_three(x[GYRO_BIAS_B]),
-        accel_bias=_three(x[ACCEL_BIAS_B]),
-        wheel_scale=float(x[WHEEL_SCALE.start]),
-        mount=(float(x[MOUNT][0]), float(x[MOUNT][1])),
-        covariance=product(product(turn, covariance[: ATTITUDE.stop, : ATTITUDE.stop]), turn.T),
+        latitude=told[0],
+        longitude=told[1],
+        height=told[2],
+        velocity_n=_three(told[VELOCITY_N]),
+        quaternion_nb=tuple(told[QUATERNION_NB]),
+        angular_rate_b=(rate[0] - gyro_bias[0], rate[1] - gyro_bias[1], rate[2] - gyro_bias[2]),
+        acceleration_b=(force[0] - accel_bias[0], force[1] - accel_bias[1], force[2] - accel_bias[2]),
+        gyro_bias=_three(gyro_bias),
+        accel_bias=_three(accel_bias),
+        wheel_scale=nominal[WHEEL_SCALE.start],
+        mount=(nominal[MOUNT.start], nominal[MOUNT.start + 1]),
+        covariance=numbers[COVARIANCE_N].reshape(COVARIANCE_SIZE, COVARIANCE_SIZE),
         sigma_gyro_bias=_three(sigma[GYRO_BIAS]),
         sigma_accel_bias=_three(sigma[ACCEL_BIAS]),
-        sigma_wheel_scale=float(sigma[SCALE.start]),
-        sigma_mount=(float(sigma[MOUNT_ERROR][0]), float(sigma[MOUNT_ERROR][1])),
+        sigma_wheel_scale=sigma[SCALE.start],
+        sigma_mount=(sigma[MOUNT_ERROR.start], sigma[MOUNT_ERROR.start + 1]),
     )
 
 
-def _three(vector: Array) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
+def _three(vector: list[float]) -> Vector3:
+    x, y, z = vector
+    return x, y, z

@@ -119,8 +119,9 @@ def heading(
 
 def leads(state: FilterState, plan: Plan) -> bool:
     """Whether a bank is so sure of the stored heading that its state is told."""
-    believed = state.memory[plan.imu_source, LAST_VALUE] == Verdict.BELIEVED
-    return bool(state.stamps[PHASE] == CHOOSING and believed and state.bank[STORED, 0] >= LEADS)
+    if state.stamps[PHASE] != CHOOSING or state.memory[plan.imu_source, LAST_VALUE] != Verdict.BELIEVED:
+        return False
+    return bool(state.bank[STORED, 0] >= LEADS)
 
 
 def decided(state: FilterState, plan: Plan) -> bool:

@@ -10,7 +10,6 @@ missing, or the two lie further apart than `imu_gap`, the state coasts.
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 from importlib import import_module
 from importlib.util import find_spec
@@ -20,55 +19,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond import alignment, bank, health
-from fusiond.earth import Array, mat_ne
+from fusiond.answer import answer
+from fusiond.earth import Array
+from fusiond.measure import factor_of, measure, remember, shared
 from fusiond.motion import carried, constrain, watch
-from fusiond.observe import MODELS, gnss_velocity, wheel_speed
-from fusiond.observe.model import (
-    CLUTTER,
-    COMPANION,
-    CORRELATION,
-    NOISE_LEAST,
-    NOISE_MOST,
-    SHARED,
-    VALUES,
-    Observation,
-    with_rate_noise,
-)
+from fusiond.observe import MODELS, wheel_speed
+from fusiond.observe.model import VALUES
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
     BLOWN,
     CHOOSING,
     EMPTY,
     FORCE_B,
-    HEIGHT_OFFSET,
-    HEIGHT_OFFSET_ERROR,
     HELD_FORCE_B,
     HELD_RATE_B,
-    LAST_RATIO,
     LAST_VALUE,
     NEVER,
     PHASE,
-    POSITION,
-    POSITION_E,
     RATE_B,
     RATE_VARIANCE,
     RESETS,
     RUNNING,
-    T_ALIKE,
-    T_BACK,
     T_FUSED,
     T_IMU,
     T_LAST,
     T_POSITION,
-    T_REJECTED,
-    VELOCITY,
-    VELOCITY_E,
     WIDE_SIZE,
     FilterState,
     T,
 )
 from fusiond.strapdown import coast, propagate
-from fusiond.update import correlation_factor, update, whiten
 
 
 class Outcome(IntEnum):
@@ -100,15 +80,6 @@ ROW = np.dtype(
 Rows = NDArray[Any]  # structured, of dtype ROW
 
 LEAST_SPAN = 1e-4  # s: two inertial samples are not taken as closer
-BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
-OUTAGE_NS = 10_000_000_000  # a source silent for longer comes back anew, and is new for as long
-SUSPECT = 6  # times gnss_reset_s, where the receiver's motion is in question
-RESETTABLE = {  # what a source resets that was rejected for too long: error states and nominal states
-    MODEL["gnss_position"]: (POSITION, POSITION_E),
-    MODEL["gnss_velocity"]: (VELOCITY, VELOCITY_E),
-    MODEL["barometric_height"]: (HEIGHT_OFFSET_ERROR, HEIGHT_OFFSET),
-}
-NEAR = 9.0  # test ratio up to which a fix after an outage is believed soon
 
 
 class Kernel:
@@ -138,6 +109,10 @@ class Kernel:
 
     def predict(self, state: FilterState, t_ns: int) -> None:
         predict(state, t_ns, self.plan)
+
+    def answer(self, nominal: Array, covariance: Array) -> Array:
+        """The state in north-east-down (fusiond.answer.answer)."""
+        return answer(nominal, covariance)
 
     def place(self, begin: int, end: int, t_ns: int, source: int, sequence: int) -> int:
         """Where, counted from `begin`, an event goes among the rows begin..end; if its very key is there already in row i,
@@ -283,8 +258,8 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
         advance(state, t_ns, rows[following_imu] if following_imu < len(rows) else None, plan)
         if plan.models[source] == IMU:
             _hold(state, t_ns, values, plan)
-        else:
-            _measure(state, row, plan)
+        elif not measure(state, row, plan):
+            row["outcome"] = Outcome.REJECTED
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
 
@@ -349,43 +324,19 @@ def _choose(state: FilterState, row: Any, imu: Any | None, plan: Plan) -> None:
     if model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan):
         row["outcome"] = Outcome.REJECTED
         return
-    factor = _factor(own, model, values, parameters, t_ns)
+    factor = factor_of(own, model, values, parameters, t_ns)
     for i in bank.alive(state):
         hypothesis = state.hypothesis(i)
         seen = MODELS[model].observe(hypothesis, values, parameters)
         assert seen is not None, "a source's model always observes"
-        seen, certain = _shared(hypothesis, seen, parameters), None
+        seen, certain = shared(hypothesis, seen, parameters), None
         if model == MODEL["wheel_speed"]:
-            certain = _shared(hypothesis, wheel_speed.observe(hypothesis, values, parameters, certain=True), parameters)
+            certain = shared(hypothesis, wheel_speed.observe(hypothesis, values, parameters, certain=True), parameters)
         bank.take(state, i, hypothesis, seen, plan.gates[len(seen.innovation)], factor, certain)
     own[T_FUSED] = t_ns
     if model == MODEL["gnss_position"]:
         stamps[T_POSITION] = t_ns
     bank.settle(state, plan)
-
-
-def _shared(state: FilterState, seen: Observation, parameters: Array) -> Observation:
-    """An observation with what it shares with others of its group, and with the gyro's noise on the lever arm."""
-    return with_rate_noise(state, seen._replace(variance=seen.variance * parameters[SHARED]))
-
-
-def remember(memory: Array, model: int, values: Array) -> None:
-    """What the motion detector wants to know of a source's last reading."""
-    if model == MODEL["wheel_speed"]:
-        memory[LAST_VALUE] = values[wheel_speed.SPEED]
-    elif model == MODEL["gnss_velocity"]:
-        memory[LAST_VALUE] = gnss_velocity.least_speed(values)
-
-
-def _factor(stamps: NDArray[np.int64], model: int, values: Array, parameters: Array, t_ns: int) -> float:
-    """How much less a reading is worth because its error is like that of the one before."""
-    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
-    return correlation_factor(interval, correlation(model, values, parameters))
-
-
-def correlation(model: int, values: Array, parameters: Array) -> float:
-    """Time [s] over which a reading's error stays alike."""
-    return float(values[wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION])
 
 
 def _hold(state: FilterState, t_ns: int, values: Array, plan: Plan) -> None:
@@ -406,100 +357,6 @@ def _keep_sample(state: FilterState, t_ns: int, values: Array, plan: Plan) -> No
     auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = values[0:3]
     auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = values[3:6]
     watch(state, values[0:3], values[3:6], dt, plan)
-
-
-def _measure(state: FilterState, row: Any, plan: Plan) -> None:
-    """Judge and fuse one measurement at the state's own instant."""
-    source, t_ns = int(row["source"]), int(row["t_ns"])
-    model, values = plan.models[source], row["values"]
-    parameters, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
-    same, elapsed = health.arrive(memory, stamps, values, t_ns)
-    remember(memory, model, values)
-    seen = MODELS[model].observe(state, values, parameters)
-    assert seen is not None, "a source's model always observes"
-    m = len(seen.innovation)
-    predicted = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian)
-    given = _shared(state, seen, parameters).variance
-    learnt = given * health.noise_factor(memory, parameters[NOISE_LEAST], parameters[NOISE_MOST])
-    row["innovation"][:m], row["variance"][:m] = seen.innovation, predicted + learnt
-    factor = _factor(stamps, model, values, parameters, t_ns)
-    if stamps[T_LAST] == NEVER or t_ns - int(stamps[T_LAST]) > OUTAGE_NS:
-        stamps[T_FUSED], stamps[T_BACK] = NEVER, t_ns
-        health.begin(memory)
-    known = stamps[T_FUSED] != NEVER and health.tells(predicted, learnt)
-    if known and health.is_due(stamps, t_ns, correlation(model, values, parameters)):
-        whitened = whiten(state, seen._replace(variance=learnt))
-        if whitened is not None:
-            health.judge(memory, stamps, health.Judgement(whitened, same, t_ns))
-    health.learn(memory, (seen.innovation, given), predicted, elapsed)
-    companion = int(parameters[COMPANION])
-    trusted = health.is_trusted(memory) and (companion < 0 or health.is_trusted(state.memory[companion]))
-    trusted = trusted and not (model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan))
-    seen = seen._replace(variance=learnt * health.noisy_factor(memory))
-    ratio, fused = update(state, seen, plan.gates[m], factor, trusted, float(parameters[CLUTTER]))
-    row["ratio"] = memory[LAST_RATIO] = ratio
-    if not fused and model in RESETTABLE and _locked_out(state, source, seen, t_ns, plan):
-        _reset_block(state, seen, model)
-        health.begin(memory)
-        fused = True
-    if fused:
-        stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
-        stamps[T_FUSED] = t_ns
-        if model == MODEL["gnss_position"]:
-            state.stamps[T_POSITION] = t_ns
-        return
-    row["outcome"] = Outcome.REJECTED
-    if stamps[T_REJECTED] == NEVER:
-        stamps[T_REJECTED] = t_ns
-
-
-def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, plan: Plan) -> bool:
-    """Whether a GNSS source has been rejected for so long, off alike all the time, that the state is the more likely
-    culprit: soon after an outage; later otherwise; and much later for a velocity, or a position whose velocity is not
-    trusted, because the rest of the vehicle then contradicts the receiver's motion, as in a drift-off."""
-    memory, stamps = state.memory[source], state.source_stamps[source]
-    gate = plan.gates[len(seen.innovation)]
-    off = health.moved(memory, seen.innovation, seen.variance, gate)
-    if off or stamps[T_ALIKE] == NEVER or t_ns - int(stamps[T_LAST]) > BREAK_NS:
-        stamps[T_ALIKE] = t_ns
-        return False
-    wait = plan.gnss_reset_ns
-    companion = int(plan.parameters[source, COMPANION])
-    returns = stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
-    if returns and memory[LAST_RATIO] <= NEAR:
-        wait = plan.gnss_return_ns
-    elif source in plan.velocities or (companion >= 0 and not health.is_trusted(state.memory[companion])):
-        wait = SUSPECT * wait
-    return t_ns - int(stamps[T_ALIKE]) >= wait
-
-
-def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
-    """Put position or velocity where the receiver says, with the receiver's uncertainty, and count the jump. A barometer
-    puts its own offset where the height says: that is no jump."""
-    block, nominal = RESETTABLE[model]
-    if model == MODEL["barometric_height"]:
-        _reset_offset(state, seen)
-        return
-    to_n = mat_ne(state.nominal[POSITION_E])
-    axes = len(seen.innovation)
-    state.nominal[nominal] += to_n[:axes].T @ seen.innovation
-    spread = to_n @ state.covariance[block, block] @ to_n.T
-    spread[:axes, :] = spread[:, :axes] = 0.0
-    spread[:axes, :axes] = np.diag(seen.variance)
-    state.covariance[block, :] = 0.0
-    state.covariance[:, block] = 0.0
-    state.covariance[block, block] = to_n.T @ spread @ to_n
-    state.stamps[RESETS] += 1
-
-
-def _reset_offset(state: FilterState, seen: Observation) -> None:
-    """The height offset (1,) anew, offset = reading - height, with the covariances that this gives it."""
-    state.nominal[HEIGHT_OFFSET] += seen.innovation
-    state.covariance[HEIGHT_OFFSET_ERROR, :] = state.covariance[:, HEIGHT_OFFSET_ERROR] = 0.0
-    cross = -seen.jacobian @ state.covariance
-    state.covariance[HEIGHT_OFFSET_ERROR, :] = cross
-    state.covariance[:, HEIGHT_OFFSET_ERROR] = cross.T
-    state.covariance[HEIGHT_OFFSET_ERROR, HEIGHT_OFFSET_ERROR] = -cross @ seen.jacobian.T + seen.variance
 
 
 def guard(state: FilterState) -> None:

@@ -15,12 +15,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.earth import geodetic
+from fusiond.answer import COVARIANCE_N, GEODETIC, QUATERNION_NB, VELOCITY_N
+from fusiond.earth import ecef, geodetic, mat_ne
 from fusiond.fusion import Fusion
-from fusiond.kernel import SUSPECT, Kernel, Outcome, compiled_available, make_kernel
+from fusiond.kernel import Kernel, Outcome, compiled_available, make_kernel
+from fusiond.measure import SUSPECT
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.observe.model import mat_eb
 from fusiond.plan import plan
+from fusiond.rotation import matrix
 from fusiond.sections import Config
 from fusiond.state import (
     CONSTRAINT_FUSED,
@@ -115,6 +118,23 @@ def test_elementary_functions_are_the_same_bits() -> None:
     first, second = (apply(config(), state, events, kernel).history.head.auxiliary for kernel in (True, False))
     for part in (MEAN_WEIGHT, MEAN_FORCE_B, MEAN_RATE_B, SCATTER_FORCE, SCATTER_RATE):
         np.testing.assert_array_equal(bits(np.atleast_1d(first[part])), bits(np.atleast_1d(second[part])))
+
+
+@pytest.mark.parametrize("wide", [False, True], ids=["", "wide"])
+@pytest.mark.parametrize("seed", range(20))
+def test_answer(seed: int, wide: bool) -> None:
+    """The same bits in north-east-down, all over the Earth, and the frame's definition."""
+    rng, layout = np.random.default_rng(seed), plan(config(gnss=LEARNT if wide else {}))
+    state = running_state(rng, size=layout.size)
+    state.nominal[POSITION_E] = ecef(rng.uniform(-1.57, 1.57), rng.uniform(-3.14, 3.14), rng.uniform(-100.0, 9000.0))
+    found = make_kernel(layout, False).answer(state.nominal, state.covariance)
+    assert (found == make_kernel(layout, True).answer(state.nominal, state.covariance)).all()
+    to_n = mat_ne(state.nominal[POSITION_E])
+    assert np.allclose(ecef(*found[GEODETIC]), state.nominal[POSITION_E], atol=1e-8)
+    assert np.allclose(found[VELOCITY_N], to_n @ state.nominal[VELOCITY_E])
+    assert np.allclose(matrix(found[QUATERNION_NB]), to_n @ matrix(state.nominal[QUATERNION_EB]))
+    turn = np.kron(np.eye(3), to_n)
+    assert np.allclose(found[COVARIANCE_N].reshape(9, 9), turn @ state.covariance[:9, :9] @ turn.T)
 
 
 @pytest.mark.parametrize("ahead_ms", [0, 1, 40, 200, 201, 350, 5000])
