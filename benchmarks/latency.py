@@ -1,9 +1,12 @@
 """How long a publication takes to reach a subscriber in another process, and what the daemon's CPU time goes into.
 
-    python -m benchmarks.latency [--seconds 30] [--out out/latency]
+    python -m benchmarks.latency [--seconds 30] [--real-time] [--out out/latency]
 
 Load: IMU at 400 Hz, GNSS at 10 Hz and 200 ms late, both as MAVLink over UDP from a process of their own; four wheels at
 100 Hz in one CAN frame on python-can's virtual bus; 100 publications a second over Zenoh, with the black box running.
+The reference, named in the same run: a process that does nothing but put as many bytes at the same rate to the same kind
+of reader, the autopilot's process sending as before. What the machine itself takes away is in both.
+With --real-time the daemon runs under the scheduling policy of systemd/fusiond.service; the other processes never do.
 """
 
 from __future__ import annotations
@@ -25,17 +28,22 @@ from pathlib import Path
 from typing import Any
 
 import can
+import zenoh
 from pymavlink.dialects.v20 import common
 
 from fusiond import __version__, config
 from fusiond.client import Client
 from fusiond.daemon import Daemon, punctual_loop, serve
 from fusiond.messages import StateMessage
-from fusiond.sections import Config
+from fusiond.sections import Config, Zenoh
+from fusiond_adapters.zenoh import open_session
 
 IMU_HZ, GNSS_HZ, CAN_HZ, PUBLISH_HZ = 400, 10, 100, 100
 GNSS_LATE_US = 200_000
+PRIORITY = 10  # CPUSchedulingPriority of systemd/fusiond.service
 SETTLE = 200  # first publications that are left out
+STATE_BYTES = 1900  # of a state in JSON
+REFERENCE_KEY = "benchmark/reference"
 CHANNEL = "latency"
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 SIGNALS = "\n".join(f' SG_ {name} : {16 * i}|16@1+ (0.01,0) [0|0] "km/h" Vector__XXX' for i, name in enumerate(WHEELS))
@@ -114,6 +122,31 @@ def feed(port: int, seconds: float) -> None:
                 say(common.MAVLink_heartbeat_message(kind, maker, 0, 0, common.MAV_STATE_ACTIVE, 3))
 
 
+def publish_only(port: int, seconds: float) -> None:
+    """The reference: stamps and bytes of a state's size, put at the rate of the publications."""
+    section = Zenoh(listen=[f"tcp/127.0.0.1:{port}"])
+    with open_session(section) as session:
+        publisher = session.declare_publisher(
+            REFERENCE_KEY, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME, express=True
+        )
+        print("ready", flush=True)
+        for _ in every(PUBLISH_HZ, seconds):
+            publisher.put(time.time_ns().to_bytes(8, "little") + bytes(STATE_BYTES))
+
+
+def subscribe_only(port: int, seconds: float) -> None:
+    """The reader of the reference."""
+    found: list[float] = []
+
+    def take(sample: zenoh.Sample) -> None:
+        found.append((time.time_ns() - int.from_bytes(sample.payload.to_bytes()[:8], "little")) / 1e6)
+
+    section = Zenoh(mode="client", listen=[], connect=[f"tcp/127.0.0.1:{port}"])
+    with open_session(section) as session, session.declare_subscriber(REFERENCE_KEY, take):
+        time.sleep(seconds)
+    print(f"reference, a bare Zenoh publisher to its subscriber: {quantiles(found[SETTLE:])}")
+
+
 def subscribe(port: int, seconds: float) -> None:
     """A reader: prints quantiles of how old each state is on its arrival."""
     by_tick: list[float] = []
@@ -158,10 +191,10 @@ class Meter:
         """Measure a method from now on."""
         inside: Callable[..., Any] = getattr(holder, name)
 
-        def measured(*arguments: Any) -> Any:
+        def measured(*arguments: Any, **named: Any) -> Any:
             begin, outer, self._inner = time.thread_time_ns(), self._inner, 0
             try:
-                return inside(*arguments)
+                return inside(*arguments, **named)
             finally:
                 took = time.thread_time_ns() - begin
                 self.spent[stage] = self.spent.get(stage, 0) + took - self._inner
@@ -198,12 +231,23 @@ def threads_ms() -> dict[str, float]:
 
 @contextmanager
 def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "benchmarks.latency", *map(str, arguments)]
+    command = ["chrt", "--other", "0", sys.executable, "-m", "benchmarks.latency", *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
         try:
             yield made
         finally:
             made.kill()
+
+
+def reference(udp: int, seconds: float) -> str:
+    """What `subscribe_only` says."""
+    port = free_port(socket.SOCK_STREAM)
+    longer = ("--seconds", seconds + 2)
+    with process("--publish-only", port, *longer) as publisher, process("--feed", udp, *longer):
+        assert publisher.stdout is not None
+        publisher.stdout.readline()
+        with process("--subscribe-only", port, "--seconds", seconds) as reader:
+            return reader.communicate()[0].strip()
 
 
 async def measure(folder: Path, seconds: float) -> str:
@@ -228,7 +272,7 @@ async def measure(folder: Path, seconds: float) -> str:
     daemon.stop()
     await run
     assert health is not None
-    lines = [told.strip()]
+    lines = [told.strip(), await asyncio.to_thread(reference, udp, seconds)]
     for name, latency in (("receipt to fused", health.latency_ms.fused), ("tick to outputs", health.latency_ms.published)):
         lines.append(f"inside, {name}: {latency}")
     lines.append(f"inside, tick to Zenoh's thread: {health.outputs['zenoh'].latency_ms}")
@@ -246,16 +290,27 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--out", type=Path, default=Path("out/latency"))
+    parser.add_argument("--real-time", action="store_true", help="SCHED_RR, priority 10, as the unit has it")
     parser.add_argument("--feed", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--subscribe", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--publish-only", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--subscribe-only", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.feed:
         feed(options.feed, options.seconds)
     elif options.subscribe:
         subscribe(options.subscribe, options.seconds)
+    elif options.publish_only:
+        publish_only(options.publish_only, options.seconds)
+    elif options.subscribe_only:
+        subscribe_only(options.subscribe_only, options.seconds)
     else:
         options.out.mkdir(parents=True, exist_ok=True)
-        about = f"fusiond {__version__}, Python {platform.python_version()}, {os.cpu_count()} CPUs, {options.seconds:g} s"
+        if options.real_time:
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
+        policy = "SCHED_RR" if options.real_time else "SCHED_OTHER"
+        python = platform.python_version()
+        about = f"fusiond {__version__}, Python {python}, {os.cpu_count()} CPUs, {policy}, {options.seconds:g} s"
         with asyncio.Runner(loop_factory=punctual_loop) as runner:
             report = f"{about}\n{runner.run(measure(options.out, options.seconds))}\n"
         print(report)

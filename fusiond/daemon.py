@@ -43,7 +43,8 @@ CATCH_UP_S = 0.002  # so long
 STALLED_NS = 2 * SECOND  # an estimator that has not come round for so long sends no heartbeats
 FIRST_PAUSE_S = 0.1  # before what was lost is opened again; doubled each time, up to live.reopen_max_s
 STEADY_S = 10.0  # what lasted so long begins anew with the first pause
-SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
+SWITCH_S = 0.00005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
+GIVE_WAY_S = 0.001  # the estimator leaves the processor to the outputs for so long once they have a state
 REPORT_S = 10.0  # between two lines about losses, while there are any
 
 LEVEL = {"info": logging.INFO, "notice": logging.INFO, "warning": logging.WARNING, "critical": logging.CRITICAL}
@@ -200,16 +201,23 @@ class Daemon:
         loop = asyncio.get_running_loop()
         feed_s = watchdog_s()
         next_feed, next_report = loop.time(), loop.time() + REPORT_S
+        timer, armed_ns = loop.call_later(0.0, self._wake.set), None
         while True:
-            timer = loop.call_later(self._time_to_tick(), self._wake.set)
+            if timer.when() <= loop.time() or self.live.next_tick_ns != armed_ns:
+                timer.cancel()
+                timer, armed_ns = loop.call_later(self._time_to_tick(), self._wake.set), self.live.next_tick_ns
             await self._wake.wait()
-            timer.cancel()
             self._wake.clear()
             due = self.live.next_tick_ns
-            if due is not None and self.clock.now_ns() - due > LATE_NS * self.clock.speed:
+            late = due is not None and self.clock.now_ns() - due > LATE_NS * self.clock.speed
+            if late:
                 await asyncio.sleep(CATCH_UP_S)
             ended = all(task.done() for task in inputs)
-            self.live.step(self.inputs)
+            if more := self.live.step(self.inputs, give_way=not late and self.clock.speed == 1.0):
+                self._wake.set()
+            if self.live.unfinished:
+                await asyncio.sleep(GIVE_WAY_S)
+                self.live.finish_tick()
             self._beat_ns = self.clock.now_ns()
             if feed_s is not None and loop.time() >= next_feed:
                 next_feed = loop.time() + feed_s / 2
@@ -217,7 +225,7 @@ class Daemon:
             if loop.time() >= next_report:
                 next_report = loop.time() + REPORT_S
                 self._report_losses()
-            if ended:
+            if ended and not more:
                 return
 
     def _time_to_tick(self) -> float:

@@ -75,6 +75,7 @@ class Fusion:
         self.plan = plan(config, stored)
         self.clock = Clock(config)
         self.history = History(self.plan, compiled)
+        self._carried = FilterState(len(self.plan.sources), self.plan.size)  # the head, beyond the newest inertial sample
         self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
             source: (imu_values if model == IMU else MODELS[model].values, section_of(source, model, config))
             for source, model in zip(self.plan.sources, self.plan.models, strict=True)
@@ -105,7 +106,8 @@ class Fusion:
     def estimate_at(self, t_ns: int) -> Estimate:
         """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
         instant before the head's gives the head itself."""
-        state, resets = self._told(self.history.head.copy())
+        self._carried.copy_from(self.history.head)
+        state, resets = self._told(self._carried)
         self.history.kernel.predict(state, t_ns)
         return self._estimate(state, t_ns, resets)
 

@@ -119,14 +119,14 @@ def heading(
 
 def leads(state: FilterState, plan: Plan) -> bool:
     """Whether a bank is so sure of the stored heading that its state is told."""
-    if state.stamps[PHASE] != CHOOSING or state.memory[plan.imu_source, LAST_VALUE] != Verdict.BELIEVED:
+    if state.stamps[PHASE] != CHOOSING or float(state.memory[plan.imu_source, LAST_VALUE]) != Verdict.BELIEVED:
         return False
     return bool(state.bank[STORED, 0] >= LEADS)
 
 
 def decided(state: FilterState, plan: Plan) -> bool:
     """Whether the drive has replaced a stored heading that was told: the told state has jumped."""
-    believed = state.memory[plan.imu_source, LAST_VALUE] == Verdict.BELIEVED
+    believed = float(state.memory[plan.imu_source, LAST_VALUE]) == Verdict.BELIEVED
     return bool(believed and (state.stamps[PHASE] == RUNNING or state.stamps[RESETS] > 0))
 
 

@@ -8,7 +8,7 @@ moved, and how far, is counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from operator import itemgetter
 from typing import Any, Protocol
 
@@ -59,23 +59,51 @@ class LiveEngine:
         self.to_publication = RecentLatencies()  # from the instant of a tick to its being handed to the outputs
         self._now, self._on_message = now, on_message
         self._last_ns = 0
+        self._frames: list[tuple[int, Source, Any]] = []  # received, but not taken yet
+        self._others: Iterator[Message] = iter(())  # of the tick that was made last
+        self.unfinished = False  # whether there may be some
 
     @property
     def next_tick_ns(self) -> int | None:
         """When the next tick is due; None before the first event."""
         return self.engine.next_tick_ns
 
-    def step(self, sources: Mapping[str, Source]) -> None:
-        """Take what the inboxes hold, and make the ticks that are due."""
-        frames = [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
+    def step(self, sources: Mapping[str, Source], *, give_way: bool = False) -> bool:
+        """Take what the inboxes hold, and make the ticks that are due.
+
+        With `give_way` it ends after a tick of which only the state has gone out, so that this reaches its readers before
+        the work on the other messages begins: they are left to `finish_tick`, and frames received after it to the next
+        step. Returns whether there are any.
+        """
+        self.finish_tick()
+        frames = self._frames
+        frames += [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
         frames.sort(key=itemgetter(0))
-        for t_ns, source, item in frames:
+        for number, (t_ns, source, item) in enumerate(frames):
+            due = self.engine.next_tick_ns
+            if give_way and due is not None and due < t_ns:
+                self._elapse(due)
+                self._frames = frames[number:]
+                return True
             self._take(self._ordered(t_ns), source, item)
-        now = self._now()
-        due = self.engine.next_tick_ns
+        self._frames = []
+        now, due = self._now(), self.engine.next_tick_ns
         if due is not None and due <= now:
-            self.engine.elapse(now)
-            self._last_ns = max(self._last_ns, now // MICROSECOND * MICROSECOND)
+            self._elapse(now)
+        if not give_way:
+            self.finish_tick()
+        return False
+
+    def _elapse(self, t_ns: int) -> None:
+        """Make the ticks up to an instant; whatever comes now was received after it."""
+        self.engine.elapse(t_ns)
+        self._last_ns = max(self._last_ns, t_ns // MICROSECOND * MICROSECOND)
+
+    def finish_tick(self) -> None:
+        """Everything but the state that goes out at the last tick; before anything else is taken."""
+        self.unfinished = False
+        for other in self._others:
+            self._on_message(other)
 
     def _ordered(self, t_ns: int) -> int:
         """The stamp under which a frame counts as received."""
@@ -91,6 +119,7 @@ class LiveEngine:
         taken = 0
         for event in source.decode(item, t_ns):
             self.engine.advance(t_ns)
+            self.finish_tick()
             receipt = self.engine.take(event)
             if receipt is not None:
                 self.offered += 1
@@ -105,8 +134,8 @@ class LiveEngine:
             self.record(source.file, t_ns, source.record(item, t_ns))
 
     def _tick(self, since_start_ns: int, message: StateMessage) -> None:
-        messages = self.publication.at(since_start_ns, message)
-        self._on_message(next(messages))  # the state itself, before the work on the others begins
+        self.finish_tick()
+        self._others = self.publication.at(since_start_ns, message)
+        self._on_message(next(self._others))
         self.to_publication.add(max(0, self._now() - message.t_ns))
-        for other in messages:
-            self._on_message(other)
+        self.unfinished = True

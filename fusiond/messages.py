@@ -312,8 +312,11 @@ def _checked(estimate: StateEstimate) -> tuple[State | None, str | None]:
     if not all(variance >= 0 for variance in estimate.covariance.diagonal().tolist()):
         return None, "covariance: a variance is negative or not a number"
     state = _published(estimate)
-    for name, value in zip(state.__struct_fields__, msgspec.structs.astuple(state), strict=True):
-        if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
+    values = [value if isinstance(value, tuple) else (value,) for value in msgspec.structs.astuple(state)]
+    if math.isfinite(sum(map(sum, values))):
+        return state, None
+    for name, value in zip(state.__struct_fields__, values, strict=True):
+        if not all(map(math.isfinite, value)):
             return None, f"{name}: not finite"
     return state, None
 

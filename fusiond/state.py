@@ -117,6 +117,7 @@ class FilterState:
     __slots__ = (
         "auxiliary",
         "bank",
+        "core",
         "covariance",
         "memory",
         "nominal",
@@ -138,6 +139,7 @@ class FilterState:
         self.covariance: Array = self.numbers[ends[0] : ends[1]].reshape(size, size)
         self.auxiliary: Array = self.numbers[ends[1] : ends[2]]
         self.memory: Array = self.numbers[ends[2] : ends[3]].reshape(sources, MEMORY_SIZE)
+        self.core: Array = self.numbers[: ends[3]]  # all of this, without the bank
         self.bank: Array = self.numbers[ends[3] :].reshape(HYPOTHESES, block)  # weight, nominal, covariance of each
         self.whole: Stamps = np.full(STAMPS_SIZE + sources * SOURCE_STAMPS_SIZE, NEVER, dtype=np.int64)
         self.stamps: Stamps = self.whole[:STAMPS_SIZE]
@@ -149,6 +151,7 @@ class FilterState:
         """A view of one hypothesis as a state: nominal and covariance are its own, the rest is shared."""
         view = FilterState.__new__(FilterState)
         view.size, view.numbers, view.whole, view.bank = self.size, self.numbers, self.whole, self.bank
+        view.core = self.core
         view.auxiliary, view.memory, view.stamps = self.auxiliary, self.memory, self.stamps
         view.source_stamps = self.source_stamps
         view.nominal = self.bank[number, 1 : 1 + NOMINAL_SIZE]
@@ -156,7 +159,12 @@ class FilterState:
         return view
 
     def copy_from(self, other: FilterState) -> None:
-        self.numbers[:] = other.numbers
+        """Become a snapshot of another state. The bank, most of the numbers, is all 0 but while a heading is chosen."""
+        if other.stamps[PHASE] == CHOOSING:
+            self.bank[:] = other.bank
+        elif self.stamps[PHASE] == CHOOSING:
+            self.bank[:] = 0.0
+        self.core[:] = other.core
         self.whole[:] = other.whole
 
     def copy(self) -> FilterState:

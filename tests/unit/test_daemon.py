@@ -261,7 +261,7 @@ def test_a_fault_in_an_adapter_takes_nothing_else_down(tmp_path: Path, channel: 
 def test_a_fault_in_the_estimator_ends_the_daemon(tmp_path: Path) -> None:
     run = Running(configuration(tmp_path, f"udpin:127.0.0.1:{free_port()}"))
 
-    def step(_: object) -> None:
+    def step(_: object, *, give_way: bool) -> None:
         raise ZeroDivisionError("in the estimator")
 
     run.daemon.live.step = step  # type: ignore[method-assign]

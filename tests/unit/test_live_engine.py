@@ -1,0 +1,88 @@
+"""Ticks and frames of the live engine: a state goes out before the work on the other messages, and nothing else changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common
+
+from fusiond.daemon import Daemon
+from fusiond.live import LiveEngine
+from fusiond.messages import Message, StateMessage
+from fusiond_adapters.play import PlayedClock
+from tests.unit.live import Autopilot, configuration
+
+BEGIN_NS, MS, STEP_MS = 1_760_000_000_000_000_000, 1_000_000, 3  # samples: between ticks of 10 ms, and now and then at one
+SAMPLES = 200
+
+
+class Rig:
+    """The engine of a daemon that does not run, on a clock that the test sets."""
+
+    def __init__(self, folder: Path) -> None:
+        self.clock = PlayedClock(BEGIN_NS, 1.0)
+        daemon = Daemon(configuration(folder, "udpin:127.0.0.1:0"), zenoh=False, clock=self.clock)
+        self.said: list[Message] = []
+        self.inputs = daemon.inputs
+        self.live = LiveEngine(daemon.config, self.clock.now_ns, self.said.append)
+        self._autopilot = Autopilot()
+
+    def receive(self, number: int) -> None:
+        """An inertial sample arrives."""
+        since_ns = number * STEP_MS * MS
+        rest = (*(0.0,) * 7, 0x3F, 0)
+        sample = common.MAVLink_highres_imu_message(since_ns // 1000 + 10**7, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, *rest)
+        self.clock.set(BEGIN_NS + since_ns)
+        self.inputs["mavlink.fc"].inbox.put(self.clock.now_ns(), self._autopilot.pack(sample))
+
+    def taken(self) -> int:
+        return int(self.live.engine.fusion.history.counts.sum())
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Rig:
+    return Rig(tmp_path)
+
+
+def test_the_state_goes_first_and_what_was_received_after_it_waits(rig: Rig) -> None:
+    rig.receive(0)  # and so the first tick, at which everything is told
+    assert not rig.live.step(rig.inputs, give_way=True)
+    assert [type(message) for message in rig.said] == [StateMessage]
+    assert rig.live.unfinished
+    rig.live.finish_tick()
+    assert len(rig.said) > 2
+    assert not rig.live.unfinished
+    for number in range(1, 4):  # at 3, 6 and 9 ms
+        rig.receive(number)
+        assert not rig.live.step(rig.inputs, give_way=True)
+    before, taken = len(rig.said), rig.taken()
+    rig.receive(4)  # at 12 ms, and so the tick at 10 ms before it
+    assert rig.live.step(rig.inputs, give_way=True)
+    assert [type(message) for message in rig.said[before:]] == [StateMessage]
+    assert rig.taken() == taken
+    assert not rig.live.step(rig.inputs, give_way=True)
+    assert rig.taken() == taken + 1
+
+
+def test_giving_way_changes_no_message(tmp_path: Path) -> None:
+    found = []
+    for give_way in (False, True):
+        rig = Rig(tmp_path)
+        for number in range(SAMPLES):
+            rig.receive(number)
+            while rig.live.step(rig.inputs, give_way=give_way):
+                pass
+        rig.live.finish_tick()
+        found.append(rig.said)
+    assert sum(isinstance(message, StateMessage) for message in found[0]) == SAMPLES * STEP_MS // 10
+    assert found[0] == found[1]
+
+
+def test_a_stall_is_caught_up_with_every_tick(rig: Rig) -> None:
+    for number in range(SAMPLES):
+        rig.receive(number)
+    assert not rig.live.step(rig.inputs)
+    states = [message for message in rig.said if isinstance(message, StateMessage)]
+    assert [(state.t_ns - BEGIN_NS) // MS for state in states] == list(range(0, SAMPLES * STEP_MS, 10))
+    assert isinstance(rig.said[0], StateMessage)
