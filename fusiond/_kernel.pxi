@@ -1662,7 +1662,6 @@ cdef class Kernel:
             self.stamps[T_STILL] = self.stamps[T]
 
     cdef bint stands(self) noexcept nogil:
-        cdef int i, wheels = 0, fresh = 0
         cdef double interval, own, limit
         if not self.standstill or self.auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
             return False
@@ -1674,14 +1673,7 @@ cdef class Kernel:
         limit = own * self.noise.gyro
         if self.auxiliary[SCATTER_RATE] > (self.still_gyro2 if self.still_gyro2 > limit else limit):
             return False
-        for i in range(self.sources):
-            if self.models[i] == WHEEL_SPEED:
-                wheels += 1
-                if self.stamps[T] - self.source_stamps[i * SOURCE_STAMPS_SIZE + T_LAST] <= WHEEL_FRESH_NS:
-                    fresh += 1
-                    if not fabs(self.memory[i * MEMORY_SIZE + LAST_VALUE]) <= self.still_wheel:
-                        return False
-        return (fresh > 0 or wheels == 0) and not self.carried(0.0)
+        return (not self.wheeled or self.rests()) and not self.carried(0.0)
 
     cdef bint carried(self, double speed) noexcept nogil:
         cdef int i
@@ -1695,16 +1687,22 @@ cdef class Kernel:
                     return True
         return False
 
-    cdef bint is_carried(self) noexcept nogil:
+    cdef bint rests(self) noexcept nogil:
         cdef int i
         cdef bint fresh = False
         for i in range(self.sources):
             if self.models[i] == WHEEL_SPEED:
                 if self.stamps[T] - self.source_stamps[i * SOURCE_STAMPS_SIZE + T_LAST] <= WHEEL_FRESH_NS:
                     fresh = True
-                    if not self.carried(self.memory[i * MEMORY_SIZE + LAST_VALUE]):
+                    if not fabs(self.memory[i * MEMORY_SIZE + LAST_VALUE]) <= self.still_wheel:
                         return False
         return fresh
+
+    cdef bint is_carried(self) noexcept nogil:
+        return self.rests() and self.carried(0.0)
+
+    cdef bint disputed(self, int velocity) noexcept nogil:
+        return velocity >= 0 and self.memory[velocity * MEMORY_SIZE + LAST_VALUE] > 0.0 and self.rests()
 
     cdef int due(self) noexcept nogil:
         """fusiond.motion.constraints_due: 1 still, 2 rolling, 3 both."""
@@ -2014,7 +2012,7 @@ cdef class Kernel:
         cdef double whitened[3]
         cdef double factor, elapsed = 0.0, share
         cdef int64_t pause
-        cdef bint same, trusted
+        cdef bint same, trusted, doubtful
         same = arrive(memory, stamps, row)
         if stamps[T_LAST] != NEVER:
             elapsed = (row.t_ns - stamps[T_LAST]) * 1e-9
@@ -2044,11 +2042,14 @@ cdef class Kernel:
             stamps[T_BACK] = row.t_ns
             begin_health(memory)
         pause = <int64_t>(2e9 * (row.values[2] if model == WHEEL_SPEED else parameter[3]))
-        if stamps[T_JUDGED] == NEVER or row.t_ns - stamps[T_JUDGED] >= (pause if pause > JUDGE_NS else JUDGE_NS):
+        companion = <int>parameter[COMPANION]
+        doubtful = self.disputed(row.source if model == GNSS_VELOCITY else companion)
+        if not doubtful and (
+                stamps[T_JUDGED] == NEVER or row.t_ns - stamps[T_JUDGED] >= (pause if pause > JUDGE_NS else JUDGE_NS)):
             if stamps[T_FUSED] != NEVER and tells(s, learnt, seen.m) and whiten(s, &seen, learnt, whitened):
                 judge(memory, stamps, whitened, seen.m, same, row.t_ns)
-        learn(memory, &seen, given, s, elapsed)
-        companion = <int>parameter[COMPANION]
+        if not doubtful:
+            learn(memory, &seen, given, s, elapsed)
         trusted = is_trusted(memory) and (companion < 0 or is_trusted(self.memory + companion * MEMORY_SIZE))
         if model == WHEEL_SPEED and trusted:
             trusted = not self.carried(memory[LAST_VALUE])
@@ -2075,13 +2076,14 @@ cdef class Kernel:
                 stamps[T_REJECTED] = row.t_ns
 
     cdef bint locked_out(self, Row* row, double* memory, int64_t* stamps, int companion, Observation* seen) noexcept nogil:
-        """fusiond.kernel._locked_out"""
+        """fusiond.measure._locked_out"""
         cdef bint off = moved(memory, seen, self.gates[seen.m])
         cdef int64_t wait = self.gnss_reset
         if off or stamps[T_ALIKE] == NEVER or row.t_ns - stamps[T_LAST] > BREAK_NS:
             stamps[T_ALIKE] = row.t_ns
             return False
-        if (stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS) and memory[LAST_RATIO] <= NEAR:
+        cdef bint returns = stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
+        if (returns and memory[LAST_RATIO] <= NEAR) or self.is_carried():
             wait = self.gnss_return
         elif self.models[row.source] == GNSS_VELOCITY or (
                 companion >= 0 and not is_trusted(self.memory + companion * MEMORY_SIZE)):

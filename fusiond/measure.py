@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusiond import health
 from fusiond.earth import Array, mat_ne
-from fusiond.motion import carried
+from fusiond.motion import carried, disputed, is_carried
 from fusiond.observe import MODELS, gnss_velocity, wheel_speed
 from fusiond.observe.model import (
     CLUTTER,
@@ -100,13 +100,15 @@ def measure(state: FilterState, row: Any, plan: Plan) -> bool:
     if stamps[T_LAST] == NEVER or t_ns - int(stamps[T_LAST]) > OUTAGE_NS:
         stamps[T_FUSED], stamps[T_BACK] = NEVER, t_ns
         health.begin(memory)
-    known = stamps[T_FUSED] != NEVER and health.tells(predicted, learnt)
+    companion = int(parameters[COMPANION])
+    doubtful = disputed(state, source if source in plan.velocities else companion, plan)
+    known = stamps[T_FUSED] != NEVER and health.tells(predicted, learnt) and not doubtful
     if known and health.is_due(stamps, t_ns, correlation(model, values, parameters)):
         whitened = whiten(state, seen._replace(variance=learnt))
         if whitened is not None:
             health.judge(memory, stamps, health.Judgement(whitened, same, t_ns))
-    health.learn(memory, (seen.innovation, given), predicted, elapsed)
-    companion = int(parameters[COMPANION])
+    if not doubtful:
+        health.learn(memory, (seen.innovation, given), predicted, elapsed)
     trusted = health.is_trusted(memory) and (companion < 0 or health.is_trusted(state.memory[companion]))
     trusted = trusted and not (model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan))
     seen = seen._replace(variance=learnt * health.noisy_factor(memory))
@@ -128,8 +130,9 @@ def measure(state: FilterState, row: Any, plan: Plan) -> bool:
 
 def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, plan: Plan) -> bool:
     """Whether a GNSS source has been rejected for so long, off alike all the time, that the state is the more likely
-    culprit: soon after an outage; later otherwise; and much later for a velocity, or a position whose velocity is not
-    trusted, because the rest of the vehicle then contradicts the receiver's motion, as in a drift-off."""
+    culprit: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
+    and much later for a velocity, or a position whose velocity is not trusted, because the rest of the vehicle then
+    contradicts the receiver's motion, as in a drift-off."""
     memory, stamps = state.memory[source], state.source_stamps[source]
     gate = plan.gates[len(seen.innovation)]
     off = health.moved(memory, seen.innovation, seen.variance, gate)
@@ -139,7 +142,7 @@ def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, p
     wait = plan.gnss_reset_ns
     companion = int(plan.parameters[source, COMPANION])
     returns = stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
-    if returns and memory[LAST_RATIO] <= NEAR:
+    if (returns and memory[LAST_RATIO] <= NEAR) or is_carried(state, plan):
         wait = plan.gnss_return_ns
     elif source in plan.velocities or (companion >= 0 and not health.is_trusted(state.memory[companion])):
         wait = SUSPECT * wait

@@ -74,6 +74,23 @@ def carried(state: FilterState, wheel_speed: float, plan: Plan) -> bool:
     return False
 
 
+def rests(state: FilterState, plan: Plan) -> bool:
+    """Whether every wheel that was heard lately is at rest, and one was."""
+    fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
+    return bool(fresh) and all(abs(state.memory[i, LAST_VALUE]) <= plan.motion.still_wheel_mps for i in fresh)
+
+
+def is_carried(state: FilterState, plan: Plan) -> bool:
+    """Whether all wheels rest while GNSS sees the vehicle move: its body then goes where it is carried."""
+    return rests(state, plan) and carried(state, 0.0, plan)
+
+
+def disputed(state: FilterState, velocity: int, plan: Plan) -> bool:
+    """Whether all wheels rest while a receiver, by its source `velocity` (-1: none), moves: either it is wrong, or the
+    vehicle begins to be carried. Nobody is to be blamed for that."""
+    return velocity >= 0 and bool(state.memory[velocity, LAST_VALUE] > 0.0) and rests(state, plan)
+
+
 def stands(state: FilterState, plan: Plan) -> bool:
     """Whether this instant looks like standstill: a quiet IMU, and every fresh wheel at zero (at least one, if any is
     configured)."""
@@ -86,10 +103,7 @@ def stands(state: FilterState, plan: Plan) -> bool:
         return False
     if auxiliary[SCATTER_RATE] > max(square(plan.still_gyro), own * plan.noise.gyro):
         return False
-    fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
-    if plan.wheels and not fresh:
-        return False
-    if not all(abs(state.memory[i, LAST_VALUE]) <= motion.still_wheel_mps for i in fresh):
+    if plan.wheels and not rests(state, plan):
         return False
     return not carried(state, 0.0, plan)
 
@@ -110,13 +124,7 @@ def constraints_due(state: FilterState, plan: Plan) -> tuple[bool, bool]:
         return False, False
     state.stamps[T_CONSTRAINT] = now
     still = bool(state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns)
-    return still, plan.motion.non_holonomic and not _is_carried(state, plan)
-
-
-def _is_carried(state: FilterState, plan: Plan) -> bool:
-    """Whether every fresh wheel rests while GNSS sees the vehicle move: its body then goes where it is carried."""
-    fresh = [i for i in plan.wheels if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS]
-    return bool(fresh) and all(carried(state, float(state.memory[i, LAST_VALUE]), plan) for i in fresh)
+    return still, plan.motion.non_holonomic and not is_carried(state, plan)
 
 
 def _apply(state: FilterState, which: int, plan: Plan, factor: float = 1.0) -> bool:

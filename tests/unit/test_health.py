@@ -27,6 +27,7 @@ from fusiond.state import (
     NOMINAL,
     SOURCE_STAMPS_SIZE,
     VELOCITY_E,
+    T,
 )
 from fusiond.update import detection
 from tests.conftest import needs_compiled
@@ -256,9 +257,12 @@ def test_after_an_outage_it_is_believed_again() -> None:
     assert np.linalg.norm(off_n[:2] - (18.0, 0.0)) < 2.0
 
 
-def test_a_ferry_carries_the_car(compiled: bool) -> None:
-    """Wheels at rest, GNSS at 5 m/s: the wheels are not believed, nor that the vehicle stands."""
-    truth = drive(30.0, lambda t: 5.0 * np.clip((t - 10.0) / 8.0, 0.0, 1.0), lambda t: 0.3 + 0 * t, rate=50.0)
+@pytest.mark.parametrize("gets_under_way_s", [8.0, 40.0])
+def test_a_ferry_carries_the_car(compiled: bool, gets_under_way_s: float) -> None:
+    """Wheels at rest, GNSS at 5 m/s: the wheels are not believed, nor that the vehicle stands. While the ferry is slow it
+    is not the receiver that is to blame for that."""
+    speed = lambda t: 5.0 * np.clip((t - 10.0) / gets_under_way_s, 0.0, 1.0)  # noqa: E731
+    truth = drive(20.0 + gets_under_way_s, speed, lambda t: 0.3 + 0 * t, rate=50.0)
     events = []
     for event in measurements(truth):
         payload = WheelSpeed(0.0) if isinstance(event.payload, WheelSpeed) else event.payload
@@ -267,6 +271,8 @@ def test_a_ferry_carries_the_car(compiled: bool) -> None:
     fusion = fuse(settings, events, compiled)
     assert np.linalg.norm(fusion.history.head.nominal[VELOCITY_E] - truth.velocity_e[-1]) < 0.5
     assert miss(fusion, truth) < 4.0
+    beliefs = fusion.beliefs(int(fusion.history.head.stamps[T]))
+    assert {beliefs[source].status for source in ("gps0.position", "gps0.velocity")} == {"nominal"}
 
 
 def test_sources_that_were_never_heard(compiled: bool) -> None:
