@@ -1,5 +1,7 @@
 """Builds the compiled kernel in its two widths; all else is in pyproject.toml. Without a compiler it is left out."""
 
+from pathlib import Path
+
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
@@ -8,7 +10,7 @@ KERNELS = [
     Extension(
         f"fusiond.{name}",
         [f"fusiond/{name}.pyx"],
-        depends=["fusiond/_kernel.pxi"],
+        depends=["fusiond/_kernel.pxi", *map(str, sorted(Path("fusiond/compiled").glob("*.pxi")))],
         extra_compile_args=["-O3", "-ffp-contract=off"],
     )
     for name in ("_kernel", "_kernel_wide")
