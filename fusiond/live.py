@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from operator import itemgetter
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from fusiond.engine import Engine
 from fusiond.kernel import Outcome
@@ -21,6 +21,7 @@ from fusiond.sections import Config
 from fusiond.stored import StoredState
 
 MICROSECOND = 1_000  # ns
+MOST_FRAMES = 256  # taken at once
 MOVED_NS = 100 * MICROSECOND  # less is only to tell apart frames that were read at once
 
 OnMessage = Callable[[Message], None]
@@ -73,16 +74,20 @@ class LiveEngine:
 
         With `give_way` it ends after a tick of which only the state has gone out, so that this reaches its readers before
         the work on the other messages begins: they are left to `finish_tick`, and frames received after it to the next
-        step. Returns whether there are any.
+        step. So are frames beyond the first MOST_FRAMES: however great the load, whoever calls this comes round. Returns
+        whether frames are left.
         """
         self.finish_tick()
         frames = self._frames
-        frames += [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
-        frames.sort(key=itemgetter(0))
+        if len(frames) < MOST_FRAMES:  # the others may wait where they are bounded
+            frames += [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
+            frames.sort(key=itemgetter(0))
         for number, (t_ns, source, item) in enumerate(frames):
             due = self.engine.next_tick_ns
-            if give_way and due is not None and due < t_ns:
-                self._elapse(due)
+            ticks = give_way and due is not None and due < t_ns
+            if ticks:
+                self._elapse(cast(int, due))
+            if ticks or number == MOST_FRAMES:
                 self._frames = frames[number:]
                 return True
             self._take(self._ordered(t_ns), source, item)

@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common
 
 from fusiond.daemon import Daemon
-from fusiond.live import LiveEngine
+from fusiond.live import MOST_FRAMES, LiveEngine
 from fusiond.messages import Message, StateMessage
 from fusiond_adapters.play import PlayedClock
 from tests.unit.live import Autopilot, configuration
@@ -86,3 +86,15 @@ def test_a_stall_is_caught_up_with_every_tick(rig: Rig) -> None:
     states = [message for message in rig.said if isinstance(message, StateMessage)]
     assert [(state.t_ns - BEGIN_NS) // MS for state in states] == list(range(0, SAMPLES * STEP_MS, 10))
     assert isinstance(rig.said[0], StateMessage)
+
+
+def test_a_flood_is_taken_in_parts(rig: Rig) -> None:
+    for number in range(2 * MOST_FRAMES + 10):
+        rig.receive(number)
+    for part in range(1, 3):
+        assert rig.live.step(rig.inputs)
+        assert rig.taken() == part * MOST_FRAMES
+    assert not rig.live.step(rig.inputs)
+    assert rig.taken() == 2 * MOST_FRAMES + 10
+    ticks = {message.t_ns for message in rig.said if isinstance(message, StateMessage)}
+    assert len(ticks) == -(-(2 * MOST_FRAMES + 10) * STEP_MS // 10)
