@@ -43,7 +43,7 @@ CATCH_UP_S = 0.002  # so long
 STALLED_NS = 2 * SECOND  # an estimator that has not come round for so long sends no heartbeats
 FIRST_PAUSE_S = 0.1  # before what was lost is opened again; doubled each time, up to live.reopen_max_s
 STEADY_S = 10.0  # what lasted so long begins anew with the first pause
-SWITCH_S = 0.0002  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
+SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
 GIVE_WAY_S = 0.001  # the estimator leaves the processor to the outputs for so long once they have a state
 REPORT_S = 10.0  # between two lines about losses, while there are any
 
