@@ -24,9 +24,8 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 import msgspec
-from pymavlink.dialects.v20 import common
 
-from benchmarks.latency import CAN_HZ, GNSS_HZ, GNSS_LATE_US, IMU_HZ, configuration, free_port, process, turn_wheels
+from benchmarks.latency import CAN_HZ, IMU_HZ, configuration, free_port, process, sent_by_autopilot, turn_wheels
 from fusiond.daemon import Daemon, punctual_loop
 from fusiond.messages import StateMessage, encode
 from fusiond.replay import Replay, Wants
@@ -37,6 +36,8 @@ from fusiond_adapters.play import PlayedClock
 
 SECOND = 1_000_000_000  # ns
 BEGIN_NS = 1_760_000_000 * SECOND
+SINCE_BOOT_NS = 60 * SECOND  # at the start
+APART_NS = 200_000  # frames of one instant
 SETTLED_S = 300.0  # memory is flat from here on
 FLAT_MB = 2.0
 DIGEST = 8  # bytes of a publication's digest
@@ -89,27 +90,13 @@ class Memory:
 
 def frames(seconds: float) -> Iterator[tuple[int, bytes | CanFrame]]:
     """Instant [ns from the start] and frame: what benchmarks.latency sends, from a vehicle at rest."""
-    link = common.MAVLink(None, srcSystem=1, srcComponent=1)
-
-    def packed(message: common.MAVLink_message) -> bytes:
-        frame = bytes(message.pack(link))
-        link.seq = (link.seq + 1) & 0xFF
-        return frame
-
-    for number in range(round(IMU_HZ * seconds)):
+    for number, (imu, *others) in enumerate(sent_by_autopilot(SINCE_BOOT_NS, seconds)):
         t_ns = number * SECOND // IMU_HZ
-        us = t_ns // 1000 + 60_000_000  # since boot
-        wobble = 0.01 * (number % 7 - 3)
-        rest = (*(0.0,) * 7, 0x3F, 0)
-        yield t_ns, packed(common.MAVLink_highres_imu_message(us, wobble, 0.0, -9.81, 1e-4, wobble / 10, 0.0, *rest))
+        yield t_ns, imu
         if number % (IMU_HZ // CAN_HZ) == 0:
-            yield t_ns + 200_000, CanFrame(256, False, bytes(8))
-        if number % (IMU_HZ // GNSS_HZ) == 0:
-            yield t_ns + 400_000, packed(common.MAVLink_gps_raw_int_message(
-                us - GNSS_LATE_US, 3, 481374300, 115754900, 563000, 80, 120, 0, 0, 14, 563000, 500, 800, 50))  # fmt: skip
-        if number % IMU_HZ == 0:
-            kind, maker = common.MAV_TYPE_GROUND_ROVER, common.MAV_AUTOPILOT_GENERIC
-            yield t_ns + 600_000, packed(common.MAVLink_heartbeat_message(kind, maker, 0, 0, common.MAV_STATE_ACTIVE, 3))
+            yield t_ns + APART_NS, CanFrame(256, False, bytes(8))
+        for place, datagram in enumerate(others, 2):
+            yield t_ns + place * APART_NS, datagram
 
 
 def accelerated(settings: Config, seconds: float, published: Published, memory: Memory, box: Path) -> Daemon:

@@ -33,7 +33,7 @@ BRIEF = 5.0  # s: for so long after a stop in motion its heading is worth someth
 
 
 class Verdict(IntEnum):
-    """What became of a stored state at the start, in stamps[HOT_START]."""
+    """What became of a stored state at the start: LAST_VALUE in the memory of the inertial sensor."""
 
     NONE = 0  # there is none, or the filter has not started yet
     BELIEVED = 1

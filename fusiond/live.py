@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from operator import itemgetter
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 from fusiond.engine import Engine
 from fusiond.kernel import Outcome
@@ -83,11 +83,7 @@ class LiveEngine:
             frames += [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
             frames.sort(key=itemgetter(0))
         for number, (t_ns, source, item) in enumerate(frames):
-            due = self.engine.next_tick_ns
-            ticks = give_way and due is not None and due < t_ns
-            if ticks:
-                self._elapse(cast(int, due))
-            if ticks or number == MOST_FRAMES:
+            if number == MOST_FRAMES or (give_way and self._tick_before(t_ns)):
                 self._frames = frames[number:]
                 return True
             self._take(self._ordered(t_ns), source, item)
@@ -98,6 +94,14 @@ class LiveEngine:
         if not give_way:
             self.finish_tick()
         return False
+
+    def _tick_before(self, t_ns: int) -> bool:
+        """Make the tick that is due before an instant; whether there is one."""
+        due = self.engine.next_tick_ns
+        if due is None or due >= t_ns:
+            return False
+        self._elapse(due)
+        return True
 
     def _elapse(self, t_ns: int) -> None:
         """Make the ticks up to an instant; whatever comes now was received after it."""

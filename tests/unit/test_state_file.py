@@ -14,7 +14,7 @@ import can
 import numpy as np
 import pytest
 from live import Autopilot, Running, configuration, running
-from test_daemon import axle, free_port, udp
+from test_daemon import drive, free_port, udp
 
 from fusiond import config
 from fusiond.__main__ import main
@@ -61,20 +61,8 @@ def without_heading(folder: Path) -> Config:
 def stand(run: Running, port: int, bus: can.BusABC, until: Callable[[], bool]) -> None:
     """Play a vehicle at rest until something holds."""
     peer, send = udp(port)
-    autopilot, source = Autopilot(), run.daemon.inputs["mavlink.fc"]
     with closing(peer):
-        run.until(lambda: source.counts()["sessions"] == 1)
-        for round_ in range(1500):
-            if until():
-                return
-            published = len(run.messages)
-            send(autopilot.imu())
-            if round_ % 20 == 0:
-                send(autopilot.heartbeat() + autopilot.gps())
-            if round_ % 2 == 0:
-                bus.send(axle())
-            run.until(lambda published=published: len(run.messages) > published)
-    raise AssertionError(f"not reached: {run.daemon.status()}")
+        drive(run, send, bus, until, Autopilot())
 
 
 def last(run: Running) -> Mode | None:
