@@ -23,7 +23,7 @@ import msgspec
 import zenoh
 
 from benchmarks.latency import configuration, free_port, process, turn_wheels
-from fusiond.daemon import Daemon, punctual_loop, serve
+from fusiond.daemon import Daemon, serve
 from fusiond.latency import RecentLatencies
 from fusiond.sections import Config, Mcap
 
@@ -121,8 +121,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/isolation"))
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    with asyncio.Runner(loop_factory=punctual_loop) as runner:
-        print(runner.run(measure(options.out, options.seconds)))
+    print(asyncio.run(measure(options.out, options.seconds)))
 
 
 if __name__ == "__main__":

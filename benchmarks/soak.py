@@ -26,7 +26,7 @@ from typing import BinaryIO
 import msgspec
 
 from benchmarks.latency import CAN_HZ, IMU_HZ, configuration, free_port, process, sent_by_autopilot, turn_wheels
-from fusiond.daemon import Daemon, punctual_loop
+from fusiond.daemon import Daemon
 from fusiond.messages import StateMessage, encode
 from fusiond.replay import Replay, Wants
 from fusiond.sections import Config
@@ -166,8 +166,7 @@ def soak(seconds: float, out: Path, *, real_time: bool) -> bool:
             if real_time:
                 record = msgspec.structs.replace(settings.record, folder=box)
                 settings = msgspec.structs.replace(settings, record=record)
-                with asyncio.Runner(loop_factory=punctual_loop) as runner:
-                    daemon = runner.run(in_real_time(settings, seconds, published, memory))
+                daemon = asyncio.run(in_real_time(settings, seconds, published, memory))
             else:
                 daemon = accelerated(settings, seconds, published, memory, Path(box))
         growth_mb = memory.growth_mb()

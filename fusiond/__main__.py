@@ -165,15 +165,14 @@ def _seed(text: str) -> int:
 
 def run_daemon(arguments: argparse.Namespace) -> None:
     """fusiond run"""
-    from fusiond.daemon import Daemon, punctual_loop, serve  # noqa: PLC0415 - the other commands need none of its drivers
+    from fusiond.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
 
     journal.set_up()
 
     def load() -> Config:
         return config.load(arguments.config)
 
-    with asyncio.Runner(loop_factory=punctual_loop) as runner:
-        runner.run(serve(Daemon(load(), load)))
+    asyncio.run(serve(Daemon(load(), load)))
 
 
 def run_top(arguments: argparse.Namespace) -> None:

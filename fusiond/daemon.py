@@ -1,6 +1,6 @@
-"""The daemon: `fusiond run`. Inputs, each in a thread of its own under a supervisor; one task that is the estimator.
+"""The daemon: `fusiond run`. Inputs, estimator and outputs, each in a thread of its own; the event loop supervises them.
 
-The estimator's task also feeds systemd's watchdog and lets the heartbeats go out, so that both stop when it does. An
+The estimator's thread also feeds systemd's watchdog and lets the heartbeats go out, so that both stop when it does. An
 input that fails is opened again after a pause that grows; it takes nothing else down. So is an output: Zenoh is one of
 them. The end is orderly: inputs first, then what they left is fused, recorded and published, then the outputs.
 """
@@ -10,14 +10,15 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-import selectors
 import signal
 import sys
+import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event, current_thread
 from typing import Any
 
+from fusiond.estimator import Estimator
 from fusiond.live import LiveEngine
 from fusiond.messages import EventMessage, HealthMessage, InputHealth, LatencyHealth, Message, OutputHealth, StateMessage
 from fusiond.publication import Surroundings, config_message, info_message
@@ -36,15 +37,9 @@ from fusiond_adapters.outputs_table import make_outputs
 from fusiond_adapters.state_file import StateFile
 from fusiond_adapters.systemd import Notifier, watchdog_s
 
-SECOND = 1_000_000_000  # ns
-IDLE_S = 0.25  # the estimator looks around at least this often
-LATE_NS = 5_000_000  # a tick later than this waits for the inputs, which were held up as well
-CATCH_UP_S = 0.002  # so long
-STALLED_NS = 2 * SECOND  # an estimator that has not come round for so long sends no heartbeats
 FIRST_PAUSE_S = 0.1  # before what was lost is opened again; doubled each time, up to live.reopen_max_s
 STEADY_S = 10.0  # what lasted so long begins anew with the first pause
 SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
-GIVE_WAY_S = 0.001  # the estimator leaves the processor to the outputs for so long once they have a state
 REPORT_S = 10.0  # between two lines about losses, while there are any
 
 LEVEL = {"info": logging.INFO, "notice": logging.INFO, "warning": logging.WARNING, "critical": logging.CRITICAL}
@@ -78,6 +73,7 @@ class Daemon:
             self._state_file = StateFile(config.path(config.state.file), config, self.clock.now_ns())
             stored = self._state_file.stored
         self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._surroundings, stored=stored)
+        self._wake = Event()  # the estimator: there is something to do
         self.inputs = self._make_inputs(config)
         self.outputs = make_outputs(config, Around(self.clock, self.inputs)) | {one.name: one for one in outputs}
         if not zenoh:
@@ -85,18 +81,18 @@ class Daemon:
         self.published = self.reloads = 0
         self.up = asyncio.Event()  # the first turn of the estimator is done, and every output has been tried
         self.health: HealthMessage | None = None  # the latest
+        self.estimator = Estimator(self.live, self.inputs, self.clock, self._wake, self._after_turn)
         self._load, self._sinks = load, sinks
         self._stopping = asyncio.Event()
-        self._wake = asyncio.Event()
         self._stops: dict[str, Event] = {}  # ends the session of an input
         self._outputs_over = asyncio.Event()  # the estimator has ended: there is no more to come
         self._stop_output = Event()  # and so the sessions of the outputs are to end
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._recorder: Recorder | None = None
-        self._beat_ns = 0
         self._mode: str | None = None
         self._told: dict[str, int] = {}  # losses as last logged
         self._notifier = Notifier()
+        self._feed_s = watchdog_s()
+        self._next_feed_s = self._next_report_s = 0.0  # monotonic
 
     def stop(self) -> None:
         """Ask for the end. Call it from the event loop's thread."""
@@ -105,15 +101,13 @@ class Daemon:
         self._stopping.set()
         for event in self._stops.values():
             event.set()
-        self._wake.set()
 
     async def run(self) -> None:
         """Run until asked to stop. Raises OSError where the black box's folder cannot be made."""
-        self._loop = asyncio.get_running_loop()
         self._open_recorder()
         if self._recorder and self._state_file and self._state_file.stored:
             self._recorder.add("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
-        workers = len(self.inputs) + len(self.outputs) + 2
+        workers = len(self.inputs) + len(self.outputs) + 3
         executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="fusiond")
         try:
             async with asyncio.TaskGroup() as group:
@@ -121,8 +115,9 @@ class Daemon:
                     group.create_task(self._supervise(key, source, executor), name=source.about)
                     for key, source in self.inputs.items()
                 ]
-                estimator = group.create_task(self._estimate(inputs), name="estimator")
+                estimator = group.create_task(self._estimate(executor), name="estimator")
                 estimator.add_done_callback(lambda _: self._stop_outputs())
+                group.create_task(self._finish_after(inputs))
                 tried = {name: asyncio.Event() for name in self.outputs}
                 for name, output in self.outputs.items():
                     group.create_task(self._keep(output, executor, tried[name]), name=output.about)
@@ -132,6 +127,7 @@ class Daemon:
         finally:
             for event in self._stops.values():
                 event.set()
+            self.estimator.finish()
             self._stop_outputs()
             executor.shutdown(wait=True)
             if self._recorder:
@@ -144,18 +140,13 @@ class Daemon:
     def _make_inputs(self, config: Config) -> dict[str, LiveInput[Any]]:
         size = config.live.queue_frames
         links = [
-            MavlinkLink(config, link, Inbox(size, self._rouse), self.clock, self._is_alive) for link in config.mavlink
+            MavlinkLink(config, link, Inbox(size, self._wake.set), self.clock, self._is_alive) for link in config.mavlink
         ]
-        buses = [CanBus(config, bus, Inbox(size, self._rouse), self.clock) for bus in config.can]
+        buses = [CanBus(config, bus, Inbox(size, self._wake.set), self.clock) for bus in config.can]
         return {f"{kind}.{source.name}": source for kind, made in (("mavlink", links), ("can", buses)) for source in made}
 
-    def _rouse(self) -> None:
-        """From an input's thread: there is something to do."""
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._wake.set)
-
     def _is_alive(self) -> bool:
-        return self.clock.now_ns() - self._beat_ns < STALLED_NS
+        return self.estimator.is_alive()
 
     async def _supervise(self, key: str, source: LiveInput[Any], executor: ThreadPoolExecutor) -> None:
         """Keep an input open until the daemon is to stop."""
@@ -197,43 +188,23 @@ class Daemon:
 
     # --- The estimator
 
-    async def _estimate(self, inputs: Sequence[asyncio.Task[None]]) -> None:
-        loop = asyncio.get_running_loop()
-        feed_s = watchdog_s()
-        next_feed, next_report = loop.time(), loop.time() + REPORT_S
-        timer, armed_ns = loop.call_later(0.0, self._wake.set), None
-        while True:
-            if timer.when() <= loop.time() or self.live.next_tick_ns != armed_ns:
-                timer.cancel()
-                timer, armed_ns = loop.call_later(self._time_to_tick(), self._wake.set), self.live.next_tick_ns
-            await self._wake.wait()
-            self._wake.clear()
-            due = self.live.next_tick_ns
-            late = due is not None and self.clock.now_ns() - due > LATE_NS * self.clock.speed
-            if late:
-                await asyncio.sleep(CATCH_UP_S)
-            ended = all(task.done() for task in inputs)
-            if more := self.live.step(self.inputs, give_way=not late and self.clock.speed == 1.0):
-                self._wake.set()
-            if self.live.unfinished:
-                await asyncio.sleep(GIVE_WAY_S)
-                self.live.finish_tick()
-            self._beat_ns = self.clock.now_ns()
-            if feed_s is not None and loop.time() >= next_feed:
-                next_feed = loop.time() + feed_s / 2
-                self._notifier.alive(self.status())
-            if loop.time() >= next_report:
-                next_report = loop.time() + REPORT_S
-                self._report_losses()
-            if ended and not more:
-                return
+    async def _estimate(self, executor: ThreadPoolExecutor) -> None:
+        await asyncio.get_running_loop().run_in_executor(executor, _run, "estimator", self.estimator.run)
 
-    def _time_to_tick(self) -> float:
-        """Until the next tick is due, or the estimator has to look around [s]."""
-        due = self.live.next_tick_ns
-        if due is None:
-            return IDLE_S
-        return min(IDLE_S, max(0.0, (due - self.clock.now_ns()) / SECOND / self.clock.speed))
+    async def _finish_after(self, inputs: Iterable[asyncio.Task[None]]) -> None:
+        for task in inputs:
+            await task
+        self.estimator.finish()
+
+    def _after_turn(self) -> None:
+        """In the estimator's thread: nobody else feeds the watchdog."""
+        now_s = time.monotonic()
+        if self._feed_s is not None and now_s >= self._next_feed_s:
+            self._next_feed_s = now_s + self._feed_s / 2
+            self._notifier.alive(self.status())
+        if now_s >= self._next_report_s:
+            self._next_report_s = now_s + REPORT_S
+            self._report_losses()
 
     # --- The stored state
 
@@ -243,7 +214,7 @@ class Daemon:
         while not over:
             await _first(self._outputs_over, self.config.state.every_s)
             over = self._outputs_over.is_set()
-            newest = self.live.engine.fusion.to_store()
+            newest = await asyncio.wrap_future(self.estimator.ask(self.live.engine.fusion.to_store))
             if newest is not None:
                 await asyncio.get_running_loop().run_in_executor(executor, file.write, newest)
 
@@ -382,9 +353,10 @@ class Daemon:
         for output in self.outputs.values():
             self._introduce(output)
         if any(key.startswith("record.") for key in keys):
-            if self._recorder:
-                self._recorder.close()
+            last = self._recorder
             self._open_recorder()
+            if last:
+                self.estimator.ask(last.close)  # which may be adding to it now
 
     def _open_recorder(self) -> None:
         section, self._recorder = self.config.record, None
@@ -393,12 +365,12 @@ class Daemon:
         self.live.record = self._recorder.add if self._recorder else None
 
 
-def _run(name: str, session: Callable[[Event], None], stop: Event) -> None:
-    """A session in a thread of the pool, which bears its name meanwhile."""
+def _run(name: str, call: Callable[..., None], *arguments: Any) -> None:
+    """A call in a thread of the pool, which bears its name meanwhile."""
     thread = current_thread()
     pooled, thread.name = thread.name, name
     try:
-        session(stop)
+        call(*arguments)
     finally:
         thread.name = pooled
 
@@ -410,11 +382,6 @@ async def _first(event: asyncio.Event, seconds: float) -> None:
             await event.wait()
     except TimeoutError:
         return
-
-
-def punctual_loop() -> asyncio.AbstractEventLoop:
-    """An event loop whose timers keep to tens of microseconds; with epoll, asyncio's own choice, to a millisecond."""
-    return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
 async def serve(daemon: Daemon) -> None:

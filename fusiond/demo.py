@@ -23,7 +23,7 @@ import msgspec
 
 from fusiond import config
 from fusiond.comparison import TruthReport
-from fusiond.daemon import Daemon, punctual_loop
+from fusiond.daemon import Daemon
 from fusiond.messages import StateMessage, csv_row
 from fusiond.progress import shown
 from fusiond.replay import Options, OutputError, replay
@@ -125,8 +125,7 @@ def _play(settings: Config, speed: float) -> Played:
         is_true = speed == 1
         clock = HostClock(player.begin_ns - LEAD_NS) if is_true else PlayedClock(player.begin_ns, speed)
         daemon = Daemon(settings, sinks=[states.append], zenoh=False, clock=clock)
-        with asyncio.Runner(loop_factory=punctual_loop) as runner:
-            runner.run(_run_while_played(daemon, player))
+        asyncio.run(_run_while_played(daemon, player))
     received = sum(source.inbox.received for source in daemon.inputs.values())
     wanted = {key for source in daemon.inputs.values() if isinstance(source, CanBus) for key in source.decoder.keys}
     sent = player.sent_mavlink + sum(count for number, count in player.sent_can.items() if number in wanted)

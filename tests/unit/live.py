@@ -14,7 +14,7 @@ from threading import Condition, Thread
 from pymavlink.dialects.v20 import common
 
 from fusiond import config
-from fusiond.daemon import Daemon, punctual_loop
+from fusiond.daemon import Daemon
 from fusiond.messages import StateMessage
 from fusiond.sections import Config
 from fusiond_adapters.outputs import LiveOutput
@@ -128,8 +128,7 @@ class Running:
             await self.daemon.run()
 
         try:
-            with asyncio.Runner(loop_factory=punctual_loop) as runner:
-                runner.run(main())
+            asyncio.run(main())
         except BaseExceptionGroup as error:
             self._errors.append(error)
 

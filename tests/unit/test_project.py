@@ -14,7 +14,9 @@ from fusiond.simulation import matching, scenario
 
 ROOT = Path(__file__).parents[2]
 ROOTS = {"fusiond": ROOT / "fusiond", "fusiond_adapters": ROOT / "adapters"}
-SHELL = {"__main__.py", "replay.py", "demo.py", "progress.py", "daemon.py", "client.py"}  # touch files, clocks, terminals
+SHELL = {  # touch files, clocks, terminals
+    "__main__.py", "commands.py", "replay.py", "demo.py", "progress.py", "daemon.py", "estimator.py", "client.py"
+}  # fmt: skip
 OUTSIDE = {"fusiond_adapters", "pymavlink", "can", "cantools", "zenoh", "socket", "time", "asyncio", "matplotlib"}
 MODULES = sorted(path for root in ROOTS.values() for path in root.rglob("*.py"))
 CORE = [path for path in MODULES if path.is_relative_to(ROOTS["fusiond"]) and path.name not in SHELL]
