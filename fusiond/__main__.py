@@ -4,29 +4,16 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import logging
 import math
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from fusiond import __version__, config, demo, mounting, report
-from fusiond.clock import Clock
-from fusiond.comparison import TruthError, Window
-from fusiond.describe import description, oddities
-from fusiond.mounting import MountingError
-from fusiond.progress import shown
-from fusiond.replay import Options, OutputError, UsageError, parse_interval, parse_withheld, replay
+from fusiond import __version__, config
+from fusiond.errors import UnusableError, UsageError
 from fusiond.sections import Config
-from fusiond.simulation import scenario
-from fusiond.toml_file import ConfigError
 from fusiond_adapters import journal
-from fusiond_adapters.can import CanDecoder
-from fusiond_adapters.logs import LogError
-from fusiond_adapters.logs.merge import open_logs
-from fusiond_adapters.logs.write import write_drive
-from fusiond_adapters.mavlink import MavlinkDecoder
 
 SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
 
@@ -66,6 +53,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=f"Try `fusiond demo` first. {EXIT_CODES}",
     )
     top.add_argument("--version", action="version", version=f"fusiond {__version__}")
+    top.set_defaults(run=run_command)
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     run = _add(commands, "run", "fuse the live inputs, and publish the state")
     run.description, run.epilog = RUN, f"example:\n  fusiond run --config car.toml\n\n{EXIT_CODES}"
@@ -80,27 +68,22 @@ def parser() -> argparse.ArgumentParser:
     )
     watch.add_argument("--zenoh", metavar="FILE", help="Zenoh's own configuration file, for TLS and the like")
     watch.add_argument("--once", action="store_true", help="print one screen as text, and end")
-    watch.set_defaults(run=run_top)
     check = _add(commands, "check", "say what a configuration is going to do, or what is wrong with it")
     check.epilog = "example:\n  fusiond check --config car.toml"
     check.add_argument("--config", metavar="C.toml", required=True, help="configuration file")
-    check.set_defaults(run=run_check)
     mount = _add(commands, "mount", "find how the IMU is turned in the vehicle, from logs")
     mount.description, mount.epilog = MOUNT, "example:\n  fusiond mount --config car.toml drive.tlog drive.log"
     mount.add_argument("logs", metavar="LOG", nargs="+", help="as for replay")
     mount.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
-    mount.set_defaults(run=run_mount)
     simulate = _add(commands, "simulate", "write the logs of a simulated drive, and the truth about it")
     simulate.epilog = "example:\n  fusiond simulate --config configs/simulate-demo.toml --out drive"
     simulate.add_argument("--config", metavar="S.toml", required=True, help="scenario file")
     simulate.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder to write to; made if need be")
     simulate.add_argument("--seed", metavar="N", type=_seed, help="in place of the scenario's seed")
-    simulate.set_defaults(run=run_simulate)
     show = _add(commands, "demo", "play a bundled drive to a running fusiond, and explain what comes out")
     show.epilog = "example:\n  fusiond demo --out out/demo"
     show.add_argument("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="default: out/demo")
     show.add_argument("--speed", metavar="X", type=_positive, default=15.0, help="X times real time; default: 15")
-    show.set_defaults(run=run_demo)
     return top
 
 
@@ -133,7 +116,6 @@ def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add("--rate", metavar="HZ", type=_rate, help="publications per second; default: publish.rate_hz of the config")
     add("--speed", metavar="X", type=_positive, help="replay at X times real time; default: as fast as possible")
     add("--publish", action="store_true", help="also publish every state over Zenoh, as configured")
-    command.set_defaults(run=run_replay)
 
 
 def _positive(text: str) -> float:
@@ -175,78 +157,11 @@ def run_daemon(arguments: argparse.Namespace) -> None:
     asyncio.run(serve(Daemon(load(), load)))
 
 
-def run_top(arguments: argparse.Namespace) -> None:
-    """fusiond top"""
-    from fusiond.client import ClientError  # noqa: PLC0415 - Zenoh is slow to import
-    from fusiond_adapters.top import run  # noqa: PLC0415
+def run_command(arguments: argparse.Namespace) -> None:
+    """Any other command."""
+    from fusiond.commands import COMMANDS  # noqa: PLC0415 - the daemon is up sooner without what only they need
 
-    try:
-        run(arguments.connect, arguments.vehicle, arguments.zenoh, just_once=arguments.once)
-    except ClientError as error:
-        raise OutputError(str(error)) from error
-
-
-def run_replay(arguments: argparse.Namespace) -> None:
-    """fusiond replay"""
-    loaded = config.load(arguments.config)
-    if arguments.window and not arguments.truth:
-        raise UsageError("--window limits the comparison with a truth: give --truth as well")
-    options = Options(
-        config=loaded,
-        config_name=Path(arguments.config).name,
-        logs=arguments.logs,
-        csv=arguments.csv,
-        json=arguments.json,
-        truth=arguments.truth,
-        plot=arguments.plot,
-        mcap=arguments.mcap,
-        stored=arguments.stored,
-        withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
-        window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
-        rate_hz=arguments.rate,
-        speed=arguments.speed,
-        publish=arguments.publish,
-    )
-    print(report.text(replay(options)))
-
-
-def run_check(arguments: argparse.Namespace) -> None:
-    """fusiond check"""
-    loaded = config.load(arguments.config)
-    for link in loaded.mavlink:
-        MavlinkDecoder(loaded, link)
-    decoders = [CanDecoder(loaded, bus) for bus in loaded.can]
-    for line in description(loaded):
-        print(line)
-    odd = [*oddities(loaded), *(warning for decoder in decoders for warning in decoder.warnings)]
-    for line in odd:
-        print(f"warning: {line}")
-    print(f"{arguments.config}: can be used" + (f", with {len(odd)} warning(s)" if odd else ""))
-
-
-def run_mount(arguments: argparse.Namespace) -> None:
-    """fusiond mount"""
-    loaded = config.load(arguments.config)
-    ((source, imu),) = loaded.imu.items()
-    logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), mounting.Gathering(loaded)
-    progress = shown(logs, lambda: logs.bytes_read / logs.bytes_total, lambda: gathering.elapsed_ns, sys.stderr)
-    for received in progress:
-        measurement = clock.align(received)
-        if measurement is not None:
-            gathering.add(measurement)
-    print(mounting.text(mounting.find(gathering.windows(), imu.rotation_deg), source))
-
-
-def run_simulate(arguments: argparse.Namespace) -> None:
-    """fusiond simulate"""
-    for path in write_drive(scenario.load(arguments.config), arguments.out, arguments.seed):
-        print(f"{path}  {path.stat().st_size / 1e3:.0f} kB")
-
-
-def run_demo(arguments: argparse.Namespace) -> None:
-    """fusiond demo"""
-    journal.set_up(logging.ERROR)  # what the daemon would log on the way is explained at the end
-    demo.run(arguments.out, arguments.speed)
+    COMMANDS[arguments.command](arguments)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -255,9 +170,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments.run(arguments)
         sys.stdout.flush()
-    except (ConfigError, UsageError) as error:
+    except UsageError as error:
         return _failed(str(error), USAGE)
-    except (LogError, TruthError, OutputError, MountingError) as error:
+    except UnusableError as error:
         return _failed(str(error), UNUSABLE)
     except BrokenPipeError:  # whoever read our output has gone; keep the interpreter from flushing into it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from msgspec import Struct
 
 from fusiond.earth import radii
+from fusiond.errors import UnusableError
 from fusiond.messages import State, StateMessage
 from fusiond.update import chi_square
 
@@ -21,7 +22,7 @@ SPEED_STEP, SPEED_LIMIT = 1e-3, 100.0  # m/s
 ANGLE_STEP, ANGLE_LIMIT = 1e-3, 180.0  # deg
 
 
-class TruthError(Exception):
+class TruthError(UnusableError):
     """A truth file that cannot be used; the message names file, line and column."""
 
 

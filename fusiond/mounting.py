@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.earth import Array
+from fusiond.errors import UnusableError
 from fusiond.measurements import GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.rotation import euler, matrix, matrix_from_euler, quaternion_exp, skew
 from fusiond.sections import Config
@@ -55,7 +56,7 @@ MEANING = {
 }
 
 
-class MountingError(Exception):
+class MountingError(UnusableError):
     """The rotation cannot be told from this drive; the message says what is missing or wrong."""
 
 

@@ -21,6 +21,7 @@ from typing import NamedTuple
 from fusiond import __version__
 from fusiond.comparison import Comparison, Errors, Truth, TruthError, TruthRow, Window, errors_of, parse_truth
 from fusiond.engine import SECOND, Engine
+from fusiond.errors import UnusableError, UsageError
 from fusiond.fusion import Receipt
 from fusiond.hot_start import WORDS, Verdict
 from fusiond.kernel import Outcome
@@ -40,11 +41,7 @@ from fusiond_adapters.state_file import read_state
 WHOLE = Window()
 
 
-class UsageError(Exception):
-    """An argument makes no sense; the message says which and what would."""
-
-
-class OutputError(Exception):
+class OutputError(UnusableError):
     """A result cannot be delivered; the message says where and why."""
 
 

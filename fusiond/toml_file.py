@@ -12,10 +12,12 @@ from typing import Annotated, Literal, TypeVar, get_args, get_origin
 import msgspec
 from msgspec import Meta, Struct
 
+from fusiond.errors import UsageError
+
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="letters, digits, underscore")]
 
 
-class ConfigError(Exception):
+class ConfigError(UsageError):
     """The configuration cannot be used; the message says where and why."""
 
 

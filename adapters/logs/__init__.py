@@ -16,13 +16,15 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fusiond.errors import UnusableError
+
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 BLOCK = 1 << 18  # bytes read at a time
 
 
-class LogError(Exception):
+class LogError(UnusableError):
     """A log that cannot be read at all; the message says which and why."""
 
 

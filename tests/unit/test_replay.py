@@ -10,11 +10,12 @@ import pytest
 
 from fusiond import config
 from fusiond.comparison import Errors, Truth, TruthRow, Window
+from fusiond.errors import UsageError
 from fusiond.fusion import Fusion, Receipt
 from fusiond.measurements import ImuSample, Invalid, Received, WheelSpeed
 from fusiond.messages import OutcomeCounts, StateMessage, csv_row, state_message
 from fusiond.progress import line, shown
-from fusiond.replay import Pacer, Replay, UsageError, Wants, Withheld, parse_interval, parse_withheld
+from fusiond.replay import Pacer, Replay, Wants, Withheld, parse_interval, parse_withheld
 from fusiond.sections import Config
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.merge import open_logs
