@@ -395,10 +395,13 @@ async def serve(daemon: Daemon) -> None:
         await daemon.run()
     finally:
         tidying.cancel()
+        gc.enable()
 
 
 async def _tidy(daemon: Daemon) -> None:
-    """Once it is up: keep the garbage collector from going through all modules again and again, for 30 ms each time."""
+    """Once it is up: keep the garbage collector from going through all modules again and again, for 30 ms each time, and
+    from working between an instant and its state: the estimator sees to it."""
     await daemon.up.wait()
     gc.collect()
     gc.freeze()
+    gc.disable()

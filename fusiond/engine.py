@@ -49,6 +49,7 @@ class Engine:
         self._on_tick, self._before_tick = on_tick, before_tick
         self._period = SECOND / Fraction(rate_hz).limit_denominator(RATE_DENOMINATOR)
         self._tick = 0  # number of the next tick
+        self._prepared: StateMessage | None = None  # its message, if nothing comes before it
         self.take: Callable[[Received], Receipt | None] = self.fusion.receive
         """Fuse an event, after `advance` to its receipt. None where it taught the clock only."""
 
@@ -70,11 +71,18 @@ class Engine:
             if self._on_tick is not None:
                 self._publish_before(t_receive_ns)
             self.now_ns = t_receive_ns
+        self._prepared = None
 
     def elapse(self, t_ns: int) -> None:
         """Make the ticks up to an instant before which no event can come any more."""
         if self.first_ns is not None:
             self._publish_before(t_ns + 1)
+
+    def prepare(self) -> None:
+        """Make the next tick's message beforehand. The tick makes it anew where an event comes before it."""
+        due = self.next_tick_ns
+        if due is not None and self._prepared is None and due < self.now_ns + LONGEST_SILENCE_NS:
+            self._prepared = self.message(due)
 
     def finish(self) -> None:
         """Make the ticks up to the last event."""
@@ -97,13 +105,14 @@ class Engine:
         while (since := self._since(self._tick)) < until:
             if self._before_tick:
                 self._before_tick(since)
-            self._on_tick(since, self.message(self.first_ns + since))
+            message, self._prepared = self._prepared or self.message(self.first_ns + since), None
+            self._on_tick(since, message)
             self.rows += 1
             self._tick += 1
         if self._since(self._tick) < t_ns - self.first_ns:
             following = -((self.first_ns - t_ns) * self._period.denominator // self._period.numerator)
             self.skipped += following - self._tick
-            self._tick = following
+            self._tick, self._prepared = following, None
 
 
 def totals(fusion: Fusion) -> OutcomeCounts:

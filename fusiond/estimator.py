@@ -1,11 +1,13 @@
 """The estimator's thread: it takes what the inputs bring, makes ticks when they are due, and shows that it lives.
 
 A thread of its own, for nothing else that the daemon does may come between an instant and its state. It wakes when an
-empty inbox fills, or when a tick is due, and never waits for anything but that.
+empty inbox fills, when a tick is near, and when it is due. What can be done before a tick is done then, what can wait
+(other messages, collecting garbage) is done after it.
 """
 
 from __future__ import annotations
 
+import gc
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -21,7 +23,10 @@ IDLE_S = 0.25  # it looks around at least this often
 LATE_NS = 5_000_000  # a tick later than this waits for the inputs, which were held up as well
 CATCH_UP_S = 0.002  # so long
 STALLED_NS = 2 * SECOND  # an estimator that has not come round for so long is not alive
+PREPARE_NS = 800_000  # before a tick its state is made, so that it can go out at once
 GIVE_WAY_S = 0.001  # it leaves the processor to the outputs for so long once they have a state
+FREE_NS = 3_000_000  # with so much time until the next tick, garbage may be collected
+YOUNG, MIDDLE, OLD = 700, 10, 10  # from when on: Python's own thresholds
 
 Result = TypeVar("Result")
 
@@ -50,7 +55,7 @@ class Estimator:
             more = False
             while more or not self._finishing:
                 if not more:
-                    self._wake.wait(self._time_to_tick())
+                    self._wake.wait(self._time_to_turn())
                 self._wake.clear()
                 more = self._turn()
             while self._turn():  # what came between the last look and the end of the inputs
@@ -94,18 +99,30 @@ class Estimator:
         self._answer_all()
         self._beat_ns = self._clock.now_ns()
         self._on_turn()
+        left_ns = self._time_left_ns()
+        if not more and left_ns is not None and 0 < left_ns <= PREPARE_NS and speed == 1.0:
+            live.engine.prepare()
+        elif left_ns is None or left_ns > FREE_NS:
+            _collect_garbage()
         return more
 
     def _answer_all(self) -> None:
         while self._asked:
             _answer(*self._asked.popleft())
 
-    def _time_to_tick(self) -> float:
-        """Until the next tick is due, or it has to look around [s]."""
+    def _time_left_ns(self) -> int | None:
+        """Until the next tick is due."""
         due = self._live.next_tick_ns
-        if due is None:
+        return None if due is None else due - self._clock.now_ns()
+
+    def _time_to_turn(self) -> float:
+        """Until there is something to do without input [s]: a tick to make or to prepare, or a look around."""
+        left_ns = self._time_left_ns()
+        if left_ns is None:
             return IDLE_S
-        return min(IDLE_S, max(0.0, (due - self._clock.now_ns()) / SECOND / self._clock.speed))
+        if left_ns > PREPARE_NS:
+            left_ns -= PREPARE_NS
+        return min(IDLE_S, max(0.0, left_ns / SECOND / self._clock.speed))
 
 
 def _answer(call: Callable[[], Any], future: Future[Any]) -> None:
@@ -113,3 +130,10 @@ def _answer(call: Callable[[], Any], future: Future[Any]) -> None:
         future.set_result(call())
     except Exception as error:  # it is the asker's
         future.set_exception(error)
+
+
+def _collect_garbage() -> None:
+    """Where Python's own collections are turned off: the same, but at a time when nothing waits for them."""
+    young, middle, old = gc.get_count()
+    if young > YOUNG and not gc.isenabled():
+        gc.collect(0 if middle < MIDDLE else 1 if old < OLD else 2)

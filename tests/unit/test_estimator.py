@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -10,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from fusiond.estimator import STALLED_NS, Estimator
+from fusiond.estimator import PREPARE_NS, STALLED_NS, Estimator
 from fusiond.live import LiveEngine
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.inputs import Inbox
@@ -28,6 +29,8 @@ class Live:
         self.ticks: list[int] = []  # when they were made
         self.next_tick_ns: int | None = None
         self.unfinished = False
+        self.engine = self
+        self.prepared: list[int] = []  # how long before a tick [ns]
         self.before_step: Callable[[], None] = lambda: None
         self._clock, self._frames = clock, list[int]()
 
@@ -46,6 +49,10 @@ class Live:
 
     def finish_tick(self) -> None:
         self.unfinished = False
+
+    def prepare(self) -> None:
+        assert self.next_tick_ns is not None
+        self.prepared.append(self.next_tick_ns - self._clock.now_ns())
 
 
 class Source:
@@ -112,6 +119,37 @@ def test_ticks_are_made_without_input() -> None:
     assert len(rig.live.ticks) >= 10
     assert all(made >= first_ns + number * 20 * MS for number, made in enumerate(rig.live.ticks))  # none before its time
     assert not rig.live.unfinished
+    assert rig.live.prepared  # not each of them, on a machine that is busy
+    assert max(rig.live.prepared) <= PREPARE_NS
+
+
+def test_garbage_is_collected_while_there_is_time() -> None:
+    """And not at any other time, where Python's own collections are off."""
+    rig, left = Rig(), []
+
+    def collecting(phase: str, _: dict[str, int]) -> None:
+        due = rig.live.next_tick_ns
+        if phase == "start" and due is not None:
+            left.append(due - rig.clock.now_ns())
+
+    def litter() -> None:
+        kept = [[number] for number in range(300)]
+        kept.append(kept)  # type: ignore[arg-type]
+
+    rig.live.before_step = litter
+    rig.live.next_tick_ns = rig.clock.now_ns() + 20 * MS
+    gc.disable()
+    gc.callbacks.append(collecting)
+    try:
+        with rig.running():
+            ends = time.monotonic() + DEADLINE
+            while len(rig.live.ticks) < 20 and time.monotonic() < ends:
+                time.sleep(0.01)
+    finally:
+        gc.callbacks.remove(collecting)
+        gc.enable()
+    assert left
+    assert min(left) > 0
 
 
 def test_what_it_is_asked_it_does_in_its_thread_and_after_its_end_here() -> None:

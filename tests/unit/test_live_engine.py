@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,32 @@ def test_the_state_goes_first_and_what_was_received_after_it_waits(rig: Rig) -> 
     assert rig.taken() == taken
     assert not rig.live.step(rig.inputs, give_way=True)
     assert rig.taken() == taken + 1
+
+
+def test_what_is_prepared_is_what_the_tick_tells(tmp_path: Path) -> None:
+    """Prepared after every sample, which is in vain where another comes before the tick: the same messages."""
+    found = []
+    for prepares in (False, True):
+        rig, made = Rig(tmp_path), 0
+        message = rig.live.engine.message
+
+        def counted(t_ns: int, message: Callable[[int], StateMessage] = message) -> StateMessage:
+            nonlocal made
+            made += 1
+            return message(t_ns)
+
+        rig.live.engine.message = counted  # type: ignore[method-assign]
+        for number in range(SAMPLES):
+            rig.receive(number)
+            rig.live.step(rig.inputs)
+            if prepares:
+                rig.live.engine.prepare()
+                rig.live.engine.prepare()  # which is not made twice
+        found.append((rig.said, made))
+    (plain, ticks), (prepared, times) = found
+    assert prepared == plain
+    assert ticks == SAMPLES * STEP_MS // 10
+    assert times == SAMPLES + SAMPLES // 10  # once after each sample, and at the ticks that come with one
 
 
 def test_giving_way_changes_no_message(tmp_path: Path) -> None:
