@@ -5,8 +5,10 @@
 Load: IMU at 400 Hz, GNSS at 10 Hz and 200 ms late, both as MAVLink over UDP from a process of their own; four wheels at
 100 Hz in one CAN frame on python-can's virtual bus; 100 publications a second over Zenoh, with the black box running.
 The reference, named in the same run: a process that does nothing but put as many bytes at the same rate to the same kind
-of reader, the autopilot's process sending as before. What the machine itself takes away is in both.
-What a host takes from its guests' processors (steal) is told for each run: it is in all figures, and they follow it.
+of reader, the autopilot's process sending as before. It, too, is measured from the instant at which a put was due.
+What a host takes from its guests' processors (steal) is in all figures, and they follow it. It is told for each run, and
+a second row has what arrived while the host took nothing: from 250 ms before the instant of the publication to 250 ms
+after its arrival the count of steal, which moves each time another 10 ms have come together, stood still.
 With --as-installed the daemon has the priority and the timers that systemd/fusiond.service gives it; the other processes
 never have.
 What the phase of the inertial samples against the publications is, chance decides anew in each run, and it matters.
@@ -16,10 +18,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import bisect
 import ctypes
 import os
 import platform
-import re
 import resource
 import socket
 import statistics
@@ -27,12 +29,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import can
+import msgspec
 import zenoh
 from pymavlink.dialects.v20 import common
 
@@ -53,13 +56,11 @@ PACKED_S = 300.0  # so much is packed beforehand
 STATE_BYTES = 1900  # of a state in JSON
 REFERENCE_KEY = "benchmark/reference"
 CHANNEL = "latency"
+LOOK_S = 0.02  # between looks at what the host took
+APART_NS = 250_000_000  # undisturbed for so long before and after
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 SIGNALS = "\n".join(f' SG_ {name} : {16 * i}|16@1+ (0.01,0) [0|0] "km/h" Vector__XXX' for i, name in enumerate(WHEELS))
 DBC = f'VERSION ""\nBU_: ECU\nBO_ 256 WHEELS: 8 ECU\n{SIGNALS}\n'
-
-
-P99 = re.compile(r"publication to the subscriber: .*?p99 ([\d.]+)")
-STEAL = re.compile(r"took away ([\d.]+) %")
 
 
 def free_port(kind: socket.SocketKind) -> int:
@@ -148,52 +149,102 @@ def sent_by_autopilot(begin_ns: int, seconds: float) -> Iterator[list[bytes]]:
 
 
 def publish_only(port: int, seconds: float) -> None:
-    """The reference: stamps and bytes of a state's size, put at the rate of the publications."""
+    """The reference: bytes of a state's size with the instant they were due, put at the rate of the publications."""
     section = Zenoh(listen=[f"tcp/127.0.0.1:{port}"])
     with open_session(section) as session:
         publisher = session.declare_publisher(
             REFERENCE_KEY, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME, express=True
         )
         print("ready", flush=True)
-        for _ in every(PUBLISH_HZ, seconds):
-            publisher.put(time.time_ns().to_bytes(8, "little") + bytes(STATE_BYTES))
+        begin_ns = time.time_ns()
+        for number in every(PUBLISH_HZ, seconds):
+            due_ns = begin_ns + number * 1_000_000_000 // PUBLISH_HZ
+            publisher.put(due_ns.to_bytes(8, "little") + bytes(STATE_BYTES))
+
+
+class Arrival(msgspec.Struct, array_like=True):
+    """Of one publication at its reader."""
+
+    t_ns: int  # the instant of the publication
+    arrived_ns: int
+    age_ms: float = 0.0  # of its newest IMU sample at the instant of the publication
+
+
+class Reading(msgspec.Struct):
+    """What a reader tells."""
+
+    arrivals: list[Arrival]
+    stolen: list[tuple[int, int]]  # instant [ns] and what the host had taken till then [ticks of all processors]
+    dropped: int = 0  # on the way to Zenoh
+
+    def stolen_share(self) -> float:
+        """Of the processors' time."""
+        (begin_ns, before), (end_ns, after) = self.stolen[0], self.stolen[-1]
+        return (after - before) / os.sysconf("SC_CLK_TCK") / ((end_ns - begin_ns) / 1e9 * (os.cpu_count() or 1))
+
+    def undisturbed(self) -> list[Arrival]:
+        """What came while the host took nothing."""
+        instants = [t_ns for t_ns, _ in self.stolen]
+        found = []
+        for arrival in self.arrivals:
+            before = bisect.bisect_right(instants, arrival.t_ns - APART_NS) - 1
+            after = bisect.bisect_left(instants, arrival.arrived_ns + APART_NS)
+            if before >= 0 and after < len(instants) and self.stolen[before][1] == self.stolen[after][1]:
+                found.append(arrival)
+        return found
+
+
+def watch_host(seconds: float) -> list[tuple[int, int]]:
+    """What the host has taken from this machine's processors, again and again."""
+    found = []
+    for _ in every(round(1 / LOOK_S), seconds):
+        found.append((time.time_ns(), int(Path("/proc/stat").read_text().split(maxsplit=9)[8])))
+    return found
+
+
+def tell(reading: Reading) -> None:
+    """To the process that started this one."""
+    reading.arrivals = reading.arrivals[SETTLE:]
+    sys.stdout.buffer.write(msgspec.json.encode(reading))
 
 
 def subscribe_only(port: int, seconds: float) -> None:
     """The reader of the reference."""
-    found: list[float] = []
+    found: list[Arrival] = []
 
     def take(sample: zenoh.Sample) -> None:
-        found.append((time.time_ns() - int.from_bytes(sample.payload.to_bytes()[:8], "little")) / 1e6)
+        found.append(Arrival(int.from_bytes(sample.payload.to_bytes()[:8], "little"), time.time_ns()))
 
     section = Zenoh(mode="client", listen=[], connect=[f"tcp/127.0.0.1:{port}"])
     with open_session(section) as session, session.declare_subscriber(REFERENCE_KEY, take):
-        time.sleep(seconds)
-    print(f"reference, a bare Zenoh publisher to its subscriber: {quantiles(found[SETTLE:])}")
+        stolen = watch_host(seconds)
+    tell(Reading(found, stolen))
 
 
 def subscribe(port: int, seconds: float) -> None:
-    """A reader: prints quantiles of how old each state is on its arrival."""
-    by_tick: list[float] = []
-    by_sample: list[float] = []
+    """A reader of states."""
+    found: list[Arrival] = []
 
     def take(message: StateMessage) -> None:
-        age_ms = (time.time_ns() - message.t_ns) / 1e6
-        by_tick.append(age_ms)
-        by_sample.append(age_ms + (message.age_ms or 0.0))
+        found.append(Arrival(message.t_ns, time.time_ns(), message.age_ms or 0.0))
 
     with Client(f"tcp/127.0.0.1:{port}", "bench") as client, client.subscribed(StateMessage, take):
         print("ready", flush=True)
-        time.sleep(seconds)
+        stolen = watch_host(seconds)
         dropped = client.health().outputs["zenoh"].dropped
-    print(f"{len(by_tick)} states received, {dropped} messages dropped on the way to Zenoh")
-    for what, found in (("instant of the publication", by_tick), ("stamp of its newest IMU sample", by_sample)):
-        print(f"from the {what} to the subscriber: {quantiles(found[SETTLE:])}")
+    tell(Reading(found, stolen, dropped))
+
+
+def latency_ms(arrivals: Iterable[Arrival]) -> list[float]:
+    return [(arrival.arrived_ns - arrival.t_ns) / 1e6 for arrival in arrivals]
 
 
 def quantiles(found: list[float]) -> str:
+    if len(found) < 2:
+        return f"{len(found)} arrivals"
     cuts = statistics.quantiles(found, n=1000)
-    return f"p50 {cuts[499]:.2f}, p90 {cuts[899]:.2f}, p99 {cuts[989]:.2f}, p99.9 {cuts[998]:.2f}, max {max(found):.2f} ms"
+    told = ", ".join(f"{name} {cuts[at]:.2f}" for name, at in (("p50", 499), ("p90", 899), ("p99", 989), ("p99.9", 998)))
+    return f"{told}, max {max(found):.2f} ms ({len(found)} arrivals)"
 
 
 def turn_wheels(seconds: float) -> None:
@@ -254,20 +305,6 @@ def threads_ms() -> dict[str, float]:
     return found
 
 
-class Stolen:
-    """What the host keeps from this machine's processors from now on; nothing where there is none that tells."""
-
-    def __init__(self) -> None:
-        self._begin, self._before_s = time.monotonic(), self._seconds()
-
-    def _seconds(self) -> float:
-        return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
-
-    def told(self) -> str:
-        whole_s = (time.monotonic() - self._begin) * (os.cpu_count() or 1)
-        return f"meanwhile the host took away {100 * (self._seconds() - self._before_s) / whole_s:.1f} % of the processors"
-
-
 def set_timer_slack(slack_ns: int) -> None:
     """Of the calling thread and those that it makes."""
     if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_TIMERSLACK, slack_ns) != 0:
@@ -284,18 +321,19 @@ def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
             made.kill()
 
 
-def reference(udp: int, seconds: float) -> str:
-    """What `subscribe_only` says."""
+def reference(udp: int, seconds: float) -> Reading:
+    """What `subscribe_only` tells."""
     port = free_port(socket.SOCK_STREAM)
     longer = ("--seconds", seconds + 2)
     with process("--publish-only", port, *longer) as publisher, process("--feed", udp, *longer):
         assert publisher.stdout is not None
         publisher.stdout.readline()
         with process("--subscribe-only", port, "--seconds", seconds) as reader:
-            return reader.communicate()[0].strip()
+            return msgspec.json.decode(reader.communicate()[0], type=Reading)
 
 
-async def measure(folder: Path, seconds: float) -> str:
+async def measure(folder: Path, seconds: float) -> tuple[Reading, str]:
+    """What reached the subscriber, and what the daemon says of itself."""
     udp, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     daemon, meter = Daemon(configuration(folder, udp, tcp)), Meter()
     run = asyncio.create_task(serve(daemon))
@@ -307,19 +345,17 @@ async def measure(folder: Path, seconds: float) -> str:
         await asyncio.to_thread(reader.stdout.readline)
         wheels.start()
         await asyncio.sleep(1)
-        before, begin, stolen = threads_ms(), time.monotonic(), Stolen()
+        before, begin = threads_ms(), time.monotonic()
         meter.spent.clear()
         await asyncio.sleep(seconds - 1)
         after, took_ms = threads_ms(), (time.monotonic() - begin) * 1000
-        meanwhile = stolen.told()
         told = await asyncio.to_thread(reader.stdout.read)
     health = daemon.health
     await asyncio.to_thread(wheels.join)
     daemon.stop()
     await run
     assert health is not None
-    stolen = Stolen()
-    lines = [told.strip(), meanwhile, await asyncio.to_thread(reference, udp, seconds), stolen.told()]
+    lines = []
     for name, latency in (("receipt to fused", health.latency_ms.fused), ("tick to outputs", health.latency_ms.published)):
         lines.append(f"inside, {name}: {latency}")
     lines.append(f"inside, tick to Zenoh's thread: {health.outputs['zenoh'].latency_ms}")
@@ -330,7 +366,16 @@ async def measure(folder: Path, seconds: float) -> str:
     stages = sorted(meter.spent.items(), key=lambda item: -item[1])
     lines += [f"  {100 * ns / 1e6 / took_ms:5.1f}  {stage}" for stage, ns in stages]
     lines += [f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB; {daemon.losses()}"]
-    return "\n".join(lines)
+    return msgspec.json.decode(told, type=Reading), "\n".join(lines)
+
+
+def told_of(what: str, readings: list[Reading]) -> str:
+    """Of one or several runs."""
+    shares = statistics.fmean(reading.stolen_share() for reading in readings)
+    all_ms = [latency for reading in readings for latency in latency_ms(reading.arrivals)]
+    calm_ms = [latency for reading in readings for latency in latency_ms(reading.undisturbed())]
+    return f"""{what}: {quantiles(all_ms)}
+  the host took {100 * shares:.1f} % of the processors; while it took nothing: {quantiles(calm_ms)}"""
 
 
 def main(arguments: list[str]) -> None:
@@ -361,19 +406,20 @@ def main(arguments: list[str]) -> None:
             set_timer_slack(TIMER_SLACK_NS)
         python, cpus = platform.python_version(), os.cpu_count()
         print(f"fusiond {__version__}, Python {python}, {cpus} CPUs, nice {nice}, {options.seconds:g} s", flush=True)
-        p99_ms, steals = [], []
-        for _ in range(options.runs):
-            report = asyncio.run(measure(options.out, options.seconds))
-            found = P99.search(report)
-            assert found is not None, "a subscriber that received nothing"
-            p99_ms.append(float(found[1]))
-            steal = STEAL.search(report)
-            assert steal is not None
-            steals.append(float(steal[1]))
+        states, references = [], []
+        for number in range(options.runs):
+            reading, report = asyncio.run(measure(options.out, options.seconds))
+            states.append(reading)
+            references.append(reference(free_port(socket.SOCK_DGRAM), options.seconds))
+            sample_ms = [(a.arrived_ns - a.t_ns) / 1e6 + a.age_ms for a in reading.arrivals]
+            print(f"run {number + 1}: {len(reading.arrivals)} states, {reading.dropped} dropped on the way to Zenoh")
+            print(told_of("from the instant of a publication to the subscriber", [reading]))
+            print(f"from the stamp of its newest IMU sample to the subscriber: {quantiles(sample_ms)}")
+            print(told_of("reference, a bare Zenoh publisher to its subscriber", [references[-1]]))
             print(report, flush=True)
-        each = ", ".join(f"{p99:.2f} ({steal:.1f} %)" for p99, steal in zip(p99_ms, steals, strict=True))
-        median = statistics.median(p99_ms)
-        print(f"p99 from the publication to the subscriber, of each run (and steal): {each}; median {median:.2f} ms")
+        print(f"\nall {options.runs} runs")
+        print(told_of("from the instant of a publication to the subscriber", states))
+        print(told_of("reference, a bare Zenoh publisher to its subscriber", references))
 
 
 if __name__ == "__main__":
