@@ -29,7 +29,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -235,8 +235,12 @@ def subscribe(port: int, seconds: float) -> None:
     tell(Reading(found, stolen, dropped))
 
 
-def latency_ms(arrivals: Iterable[Arrival]) -> list[float]:
-    return [(arrival.arrived_ns - arrival.t_ns) / 1e6 for arrival in arrivals]
+def since_due_ms(arrival: Arrival) -> float:
+    return (arrival.arrived_ns - arrival.t_ns) / 1e6
+
+
+def since_sample_ms(arrival: Arrival) -> float:
+    return since_due_ms(arrival) + arrival.age_ms
 
 
 def quantiles(found: list[float]) -> str:
@@ -369,13 +373,22 @@ async def measure(folder: Path, seconds: float) -> tuple[Reading, str]:
     return msgspec.json.decode(told, type=Reading), "\n".join(lines)
 
 
-def told_of(what: str, readings: list[Reading]) -> str:
+def told_of(what: str, readings: list[Reading], latency_ms: Callable[[Arrival], float] = since_due_ms) -> str:
     """Of one or several runs."""
-    shares = statistics.fmean(reading.stolen_share() for reading in readings)
-    all_ms = [latency for reading in readings for latency in latency_ms(reading.arrivals)]
-    calm_ms = [latency for reading in readings for latency in latency_ms(reading.undisturbed())]
-    return f"""{what}: {quantiles(all_ms)}
-  the host took {100 * shares:.1f} % of the processors; while it took nothing: {quantiles(calm_ms)}"""
+    share = statistics.fmean(reading.stolen_share() for reading in readings)
+    every_ms = [latency_ms(arrival) for reading in readings for arrival in reading.arrivals]
+    calm_ms = [latency_ms(arrival) for reading in readings for arrival in reading.undisturbed()]
+    return f"""{what}: {quantiles(every_ms)}
+  the host took {100 * share:.1f} % of the processors; while it took nothing: {quantiles(calm_ms)}"""
+
+
+def told_of_both(states: list[Reading], references: list[Reading]) -> str:
+    rows = (
+        told_of("from the instant of a publication to the subscriber", states),
+        told_of("from the stamp of its newest IMU sample to the subscriber", states, since_sample_ms),
+        told_of("reference, a bare Zenoh publisher to its subscriber", references),
+    )
+    return "\n".join(rows)
 
 
 def main(arguments: list[str]) -> None:
@@ -411,15 +424,11 @@ def main(arguments: list[str]) -> None:
             reading, report = asyncio.run(measure(options.out, options.seconds))
             states.append(reading)
             references.append(reference(free_port(socket.SOCK_DGRAM), options.seconds))
-            sample_ms = [(a.arrived_ns - a.t_ns) / 1e6 + a.age_ms for a in reading.arrivals]
             print(f"run {number + 1}: {len(reading.arrivals)} states, {reading.dropped} dropped on the way to Zenoh")
-            print(told_of("from the instant of a publication to the subscriber", [reading]))
-            print(f"from the stamp of its newest IMU sample to the subscriber: {quantiles(sample_ms)}")
-            print(told_of("reference, a bare Zenoh publisher to its subscriber", [references[-1]]))
+            print(told_of_both([reading], references[-1:]))
             print(report, flush=True)
         print(f"\nall {options.runs} runs")
-        print(told_of("from the instant of a publication to the subscriber", states))
-        print(told_of("reference, a bare Zenoh publisher to its subscriber", references))
+        print(told_of_both(states, references))
 
 
 if __name__ == "__main__":
