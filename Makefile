@@ -58,7 +58,7 @@ uninstall:
 	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf
 	packaging/postrm remove
 
-$(READY): pyproject.toml setup.py fusiond/_kernel.pxi
+$(READY): pyproject.toml setup.py $(wildcard fusiond/*.px[id] fusiond/*.pyx fusiond/compiled/*.px[id])
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
