@@ -125,7 +125,7 @@ cdef class Kernel:
             propagate(self.x, self.p, (carried - begin) * 1e-9, self.auxiliary + HELD_FORCE_B,
                       self.auxiliary + HELD_RATE_B, &self.noise)
         if t_ns > carried:
-            coast(self.x, self.p, (t_ns - carried) * 1e-9, &self.noise)
+            coast(self.x, self.p, (t_ns - carried) * 1e-9, &self.noise, self.rests())
         self.stamps[T] = t_ns
 
     def answer(self, double[::1] nominal, double[:, ::1] covariance):
@@ -236,7 +236,7 @@ cdef class Kernel:
                 row = rows + applied
                 if kept == room or not self.knows(self.models[row.source]):
                     break
-                if row.t_ns - self.stamps[T] > self.restart_gap:
+                if row.t_ns - self.stamps[T] > self.restart_gap or self.may_be_lost(row):
                     break
                 if following < applied:
                     following = applied
@@ -262,6 +262,8 @@ cdef class Kernel:
 
     cdef void step(self, Row* rows, Py_ssize_t index, Row* imu, Py_ssize_t whole_size) noexcept nogil:
         cdef Row* row = rows + index
+        cdef bint coasted
+        cdef double variance
         cdef int a
         row.ratio = 0.0  # all of an earlier run
         for a in range(3):
@@ -278,14 +280,51 @@ cdef class Kernel:
         if self.stamps[PHASE] == CHOOSING:
             self.choose(row, imu)
         else:
+            coasted = self.coasts(row.t_ns)
             self.advance(row.t_ns, imu)
+            variance = self.yaw_variance() if coasted else 0.0
             if self.models[row.source] == IMU:
                 self.hold(row)
                 self.constrain()
+            elif variance > LOST_HEADING2:
+                self.measure_lost(row, variance)
             else:
                 self.measure(row)
             self.guard(whole_size)
         self.source_stamps[row.source * SOURCE_STAMPS_SIZE + T_LAST] = row.t_ns
+
+    cdef bint may_be_lost(self, Row* row) noexcept nogil:
+        """Whether the IMU is back after so long that the heading may be lost: the twin decides."""
+        return (self.stamps[PHASE] == RUNNING and self.models[row.source] == IMU and self.coasts(row.t_ns)
+                and self.yaw_variance() + COAST_TURN2 * (row.t_ns - self.stamps[T]) * 1e-9 > LOST_HEADING2 / 2)
+
+    cdef bint coasts(self, int64_t t_ns) noexcept nogil:
+        return t_ns - self.stamps[T_IMU] > self.imu_gap
+
+    cdef double yaw_variance(self) noexcept nogil:
+        """fusiond.kernel.yaw_variance"""
+        cdef double* r = self.x + POSITION_E
+        cdef double* block = self.p + ATTITUDE * n + ATTITUDE
+        cdef double total = 0.0
+        cdef int i, j
+        for i in range(3):
+            for j in range(3):
+                total += r[i] * block[i * n + j] * r[j]
+        return total / (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+
+    cdef void measure_lost(self, Row* row, double variance) noexcept nogil:
+        """fusiond.kernel.measure_lost"""
+        cdef double* r = self.x + POSITION_E
+        cdef double* block = self.p + ATTITUDE * n + ATTITUDE
+        cdef double told
+        cdef int i, j
+        self.measure(row)
+        told = variance - self.yaw_variance()
+        if told > 0:
+            told /= r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+            for i in range(3):
+                for j in range(3):
+                    block[i * n + j] += r[i] * r[j] * told
 
     cdef bint knows(self, int32_t model) noexcept nogil:
         """Whether this kernel can take an event of a model now; a start is left to the twin, and with it GNSS until then."""
@@ -363,7 +402,8 @@ cdef class Kernel:
         self.stamps[T] = t_ns
         if imu == NULL or held == NEVER or imu.t_ns - held > self.imu_gap or \
                 not is_trusted(self.memory + self.imu_source * MEMORY_SIZE):
-            coast(self.x, self.p, dt, &self.noise)
+            coast(self.x, self.p, dt, &self.noise, self.rests())
+            a[RATE_VARIANCE] = COAST_RATE2
             return
         span = <double>(imu.t_ns - held)
         middle = <double>((begin - held) + (t_ns - held)) / 2 / span

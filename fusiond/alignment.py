@@ -48,6 +48,7 @@ from fusiond.state import (
     POSITION_E,
     QUATERNION_EB,
     RATE_B,
+    RESETS,
     REST_RATE_B,
     RUNNING,
     STORED,
@@ -120,7 +121,7 @@ def _start_by_position(state: FilterState, source: int, plan: Plan) -> None:
         return
     if _rests(state, plan):
         _start(state, source, None, plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, plan)
-    elif plan.filter.heading_deg is not None or not plan.velocities:
+    elif _given(state, plan) or not plan.velocities:
         _start(state, source, None, square(plan.filter.v_max_mps / 3), None, plan)
 
 
@@ -143,6 +144,13 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
     elif stamps[T_STILL] != NEVER:
         return  # the next position starts it
     _start(state, source, velocity_n, variance, course, plan)
+
+
+def _given(state: FilterState, plan: Plan) -> tuple[float, float] | None:
+    """The configured heading and its sigma [rad]: of the first start, and of later ones where nothing tells a newer one."""
+    if plan.filter.heading_deg is None or (state.stamps[RESETS] and plan.velocities):
+        return None
+    return math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
 
 
 def _gnss_speed(state: FilterState) -> float:
@@ -174,8 +182,7 @@ def _start(
     """Start from what was gathered: with a velocity (3,) [m/s], or None where it was not measured, and its variance; with
     a heading and sigma [rad], a given one before a measured one; and where there is none, with a bank of hypotheses all
     round, and a stored one among them."""
-    if plan.filter.heading_deg is not None:
-        heading = math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
+    heading = _given(state, plan) or heading
     stored, verdict = hot_start.recall(state, plan)
     first = _first_variances(state, stored, plan)
     if heading is not None:

@@ -10,6 +10,7 @@ missing, or the two lie further apart than `imu_gap`, the state coasts.
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from importlib import import_module
 from importlib.util import find_spec
@@ -22,11 +23,12 @@ from fusiond import alignment, bank, health
 from fusiond.answer import answer
 from fusiond.earth import Array
 from fusiond.measure import factor_of, measure, remember, shared
-from fusiond.motion import carried, constrain, watch
+from fusiond.motion import carried, constrain, rests, watch
 from fusiond.observe import MODELS, wheel_speed
 from fusiond.observe.model import VALUES
 from fusiond.plan import IMU, MODEL, Plan
 from fusiond.state import (
+    ATTITUDE,
     BLOWN,
     CHOOSING,
     EMPTY,
@@ -36,6 +38,7 @@ from fusiond.state import (
     LAST_VALUE,
     NEVER,
     PHASE,
+    POSITION_E,
     RATE_B,
     RATE_VARIANCE,
     RESETS,
@@ -48,7 +51,7 @@ from fusiond.state import (
     FilterState,
     T,
 )
-from fusiond.strapdown import coast, propagate
+from fusiond.strapdown import COAST_RATE, coast, propagate
 
 
 class Outcome(IntEnum):
@@ -79,6 +82,8 @@ ROW = np.dtype(
 )
 Rows = NDArray[Any]  # structured, of dtype ROW
 
+COAST_RATE_VARIANCE = COAST_RATE * COAST_RATE
+LOST_HEADING = math.radians(20.0)  # sigma, after coasting: the filter does not find back from such errors, but aligns anew
 LEAST_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 
 
@@ -255,13 +260,37 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
     elif stamps[PHASE] != RUNNING:
         alignment.gather(state, t_ns, source, values, plan)
     else:
+        coasted = t_ns - int(stamps[T_IMU]) > plan.imu_gap_ns
         advance(state, t_ns, rows[following_imu] if following_imu < len(rows) else None, plan)
-        if plan.models[source] == IMU:
+        variance = yaw_variance(state) if coasted else 0.0
+        lost, model = variance > LOST_HEADING * LOST_HEADING, plan.models[source]
+        if model == IMU and lost:
+            stamps[RESETS] += 1
+            alignment.begin(state)
+            alignment.gather(state, t_ns, source, values, plan)
+        elif model == IMU:
             _hold(state, t_ns, values, plan)
-        elif not measure(state, row, plan):
+        elif not (measure_lost(state, row, plan, variance) if lost else measure(state, row, plan)):
             row["outcome"] = Outcome.REJECTED
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
+
+
+def measure_lost(state: FilterState, row: Any, plan: Plan, variance: float) -> bool:
+    """Fuse a measurement when the heading, of so much variance after coasting, is lost. It tells of position and velocity;
+    what it would tell of a heading that is so far off is not to be relied on. When the IMU is back, an alignment finds it.
+    Returns whether it was fused."""
+    fused = measure(state, row, plan)
+    told = max(0.0, variance - yaw_variance(state))
+    up_e = state.nominal[POSITION_E]
+    state.covariance[ATTITUDE, ATTITUDE] += np.outer(up_e, up_e) * (told / float(up_e @ up_e))
+    return fused
+
+
+def yaw_variance(state: FilterState) -> float:
+    """Of the attitude about the vertical [rad^2]."""
+    up_e = state.nominal[POSITION_E]
+    return float(up_e @ state.covariance[ATTITUDE, ATTITUDE] @ up_e) / float(up_e @ up_e)
 
 
 def advance(state: FilterState, t_ns: int, imu: Any | None, plan: Plan) -> None:
@@ -275,7 +304,8 @@ def advance(state: FilterState, t_ns: int, imu: Any | None, plan: Plan) -> None:
     stamps[T] = t_ns
     frozen = not health.is_trusted(state.memory[plan.imu_source])
     if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns or frozen:
-        coast(state, dt, plan.noise)
+        coast(state, dt, plan.noise, rests=rests(state, plan))
+        auxiliary[RATE_VARIANCE] = COAST_RATE_VARIANCE
         return
     span = float(imu["t_ns"] - held)
     middle = ((begin - held) + (t_ns - held)) / 2 / span
@@ -302,7 +332,7 @@ def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
     if carried > begin:
         propagate(state, (carried - begin) * 1e-9, auxiliary[HELD_FORCE_B], auxiliary[HELD_RATE_B], plan.noise)
     if t_ns > carried:
-        coast(state, (t_ns - carried) * 1e-9, plan.noise)
+        coast(state, (t_ns - carried) * 1e-9, plan.noise, rests=rests(state, plan))
     stamps[T] = t_ns
 
 

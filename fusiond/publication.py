@@ -240,7 +240,8 @@ class Changes:
         if head.stamps[BLOWN] > self._blown:
             return "it was no longer finite; aligning anew"
         if head.stamps[T_START] != self._started:
-            return f"a hole in the data of more than {settings.restart_gap_s:g} s; aligning anew"
+            gap = f"more than {settings.restart_gap_s:g} s without data, or without the IMU until the heading was lost"
+            return f"{gap}; aligning anew"
         believed = [name for i, name in enumerate(fusion.plan.sources) if head.memory[i, LAST_RATIO] > 1
                     and head.source_stamps[i, T_REJECTED] == NEVER]  # fmt: skip
         return f"{' and '.join(believed) or 'GNSS'} was rejected, off alike all the time, and is now believed again"

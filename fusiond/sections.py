@@ -35,13 +35,13 @@ class Filter(Section, frozen=True, kw_only=True):
 
     horizon_s: Seconds = 1.0  # how late a measurement may be and still be put where it belongs
     snapshot_interval_s: Span = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
-    imu_gap_s: Seconds = 0.2  # an IMU silent for longer is bridged by coasting at constant velocity
+    imu_gap_s: Seconds = 0.2  # an IMU silent for longer is bridged by coasting
     restart_gap_s: Seconds = 30.0  # after a hole in the data of this length the filter aligns anew
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
     gnss_reset_s: Seconds = 30.0  # GNSS that was rejected for this long, off alike all the time, is believed again
     gnss_return_s: Seconds = 3.0  # the same where no fix was fused for 10 s before
     v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
-    heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # given start heading, clockwise from north
+    heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # heading at the first start, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
     heading_spread_deg: Annotated[float, Meta(gt=0, le=30)] = 8.0  # headings this close together are chosen between no more
     course_speed_mps: Positive = 8.0  # above this GNSS speed, at which it never reverses, its course is the start heading

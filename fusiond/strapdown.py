@@ -31,7 +31,9 @@ from fusiond.state import (
 )
 
 COAST_ACCEL = 2.0  # m/s^2/sqrt(Hz): what a vehicle may do while the inertial sensor is silent
-COAST_RATE = 0.5  # rad/s/sqrt(Hz): a car in a bend
+COAST_TURN = 0.3  # rad/s/sqrt(Hz), about the vertical: a car in a bend, where the velocity turns along
+COAST_TILT = 0.03  # rad/s/sqrt(Hz), about any axis: a car's body on its springs, and a road's slope
+COAST_RATE = 0.5  # rad/s: the angular rate is not known any better then
 LONGEST_STEP = 0.05  # s: longer intervals are propagated in equal parts
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
 EARTH_RATE_SKEW = skew(EARTH_RATE_E)
@@ -123,11 +125,21 @@ def _grow(state: FilterState, phi: Array, dt: float, accel: float, gyro: float, 
     state.covariance[:] = covariance
 
 
-def coast(state: FilterState, dt: float, noise: ProcessNoise) -> None:
+def coast(state: FilterState, dt: float, noise: ProcessNoise, *, rests: bool = False) -> None:
     """Carry the state `dt` [s] forward without inertial samples: constant velocity and attitude over the ground, with the
-    uncertainty of a vehicle that may do otherwise."""
+    uncertainty of a vehicle that may do otherwise; one that rests neither speeds up nor turns. When it turns, its velocity
+    turns along: wheels and body stay in line, whatever the heading."""
     x = state.nominal
     x[POSITION_E] += x[VELOCITY_E] * dt
     phi = np.eye(state.size)
     phi[POSITION, VELOCITY] = np.eye(3) * dt
-    _grow(state, phi, dt, square(COAST_ACCEL), square(COAST_RATE), noise)
+    _grow(state, phi, dt, 0.0 if rests else square(COAST_ACCEL), square(COAST_TILT), noise)
+    if rests:
+        return
+    up_e = x[POSITION_E] / math.sqrt(float(x[POSITION_E] @ x[POSITION_E]))
+    sideways_e = np.cross(up_e, x[VELOCITY_E])
+    turned = np.zeros((2, state.size))  # what a turn changes at once, and what it does from then on
+    turned[0, ATTITUDE], turned[0, VELOCITY], turned[1, POSITION] = up_e, sideways_e, sideways_e
+    grown = np.outer(turned[0], turned[0]) * dt + np.outer(turned[1], turned[1]) * (dt * dt * dt / 3)
+    across = np.outer(turned[0], turned[1]) * (dt * dt / 2)
+    state.covariance += square(COAST_TURN) * (grown + across + across.T)

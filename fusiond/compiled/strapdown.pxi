@@ -161,7 +161,13 @@ cdef void propagate(double* x, double* p, double dt, double* force_b, double* ra
         propagate_step(x, p, dt / parts, force_b, rate_b, noise)
 
 
-cdef void coast(double* x, double* p, double dt, Noise* noise) noexcept nogil:
+cdef void coast(double* x, double* p, double dt, Noise* noise, bint rests) noexcept nogil:
+    cdef double now[n]
+    cdef double since[n]
+    cdef double up[3]
+    cdef double* r = x + POSITION_E
+    cdef double size, first = COAST_TURN2 * dt, second = COAST_TURN2 * (dt * dt / 2)
+    cdef double third = COAST_TURN2 * (dt * dt * dt / 3)
     cdef int i, j
     for i in range(3):
         x[POSITION_E + i] += x[VELOCITY_E + i] * dt
@@ -171,7 +177,23 @@ cdef void coast(double* x, double* p, double dt, Noise* noise) noexcept nogil:
         for j in range(3):
             p[i * n + j] += dt * p[i * n + VELOCITY + j]
     mirror(p)
-    add_noise(p, dt, COAST_ACCEL2, COAST_RATE2, noise)
+    add_noise(p, dt, 0.0 if rests else COAST_ACCEL2, COAST_TILT2, noise)
+    if rests:
+        return
+    size = sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+    for i in range(n):
+        now[i] = since[i] = 0.0
+    for i in range(3):
+        up[i] = r[i] / size
+        now[ATTITUDE + i] = up[i]
+    cross(up, x + VELOCITY_E, now + VELOCITY)
+    for i in range(3):
+        since[POSITION + i] = now[VELOCITY + i]
+    for i in range(n):
+        for j in range(i, n):
+            p[i * n + j] += first * now[i] * now[j] + third * since[i] * since[j] + second * (
+                now[i] * since[j] + since[i] * now[j])
+    mirror(p)
 
 
 cdef void mirror(double* p) noexcept nogil:

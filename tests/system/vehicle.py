@@ -18,7 +18,7 @@ SECOND = 1_000_000_000  # ns
 FRAME = struct.Struct("=IB3x8s")  # linux/can.h: id and flags, length, data
 EXTENDED, ERROR = 1 << 31, 1 << 29  # flags
 IN_TIME_NS = 20_000_000  # a vehicle that is farther behind sends no copies
-BOOT_S = 1.0  # a rebooting autopilot says nothing for so long
+BOOT_S = 3.0  # a rebooting autopilot says nothing for so long
 RETRY_NS = SECOND // 10  # between two attempts to open a CAN interface that is away
 COUNTER = 0x07  # the bits of a wheel frame's last byte that count
 NOISE_HZ = 200  # of each kind

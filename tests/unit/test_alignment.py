@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.estimate import Mode
 from fusiond.fusion import Fusion
-from fusiond.kernel import Outcome
+from fusiond.kernel import Outcome, yaw_variance
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.rotation import euler, matrix, matrix_from_euler
 from fusiond.state import (
@@ -28,6 +28,7 @@ from fusiond.state import (
     VELOCITY_E,
     T,
 )
+from tests.conftest import needs_compiled
 from tests.streams import MS, SECOND, T0, Drive, config, drive, fuse, measurements
 
 HEADING = 0.4  # rad
@@ -177,9 +178,10 @@ def later(events: list[Measurement], shift_ns: int) -> list[Measurement]:
     ]
 
 
-@pytest.mark.parametrize(("gap_s", "resets"), [(7200.0, 1), (31.0, 1), (20.0, 0)])
+@pytest.mark.parametrize(("gap_s", "resets"), [(7200.0, 1), (31.0, 1), (20.0, 1), (0.5, 0)])
 def test_starts_again_after_a_gap(compiled: bool, gap_s: float, resets: int) -> None:
-    """It went on another way while nothing was heard; after the restart gap it aligns anew, and says that it jumped."""
+    """It went on another way while nothing was heard; when its heading is lost, and after the restart gap, it aligns anew,
+    and says that it jumped."""
     first, second = straight(4.0, 12.0), drive(4.0, lambda t: 12.0 + 0 * t, lambda t: 2.0 + 0 * t, rate=50.0)
     events = measurements(first) + later(measurements(second), round((4.0 + gap_s) * SECOND))
     fusion = fuse(config(), events, compiled)
@@ -192,6 +194,82 @@ def test_starts_again_after_a_gap(compiled: bool, gap_s: float, resets: int) -> 
         np.testing.assert_allclose(head.nominal[VELOCITY_E], second.velocity_e[-1], atol=0.3)
         assert attitude(fusion)[2] == pytest.approx(math.degrees(2.0), abs=1.5)
     assert fusion.totals()["FUSED"] + fusion.totals()["REJECTED"] == len(events)
+
+
+IN_BEND = 6.0  # s, when the autopilot falls silent
+
+
+def bend(speed: float = 14.0) -> Drive:
+    """As tight as a car goes around a corner."""
+    return drive(18.0, lambda t: speed + 0 * t, lambda t: HEADING + 0.2 * t, rate=50.0)
+
+
+def without(silence_s: float, events: list[Measurement]) -> list[Measurement]:
+    """While the autopilot reboots there is no IMU and no GNSS; the wheels go on."""
+    silent = range(T0 + round(IN_BEND * SECOND), T0 + round((IN_BEND + silence_s) * SECOND))
+    return [event for event in events if event.t_ns not in silent or isinstance(event.payload, WheelSpeed)]
+
+
+@pytest.mark.parametrize(("silence_s", "resets"), [(0.5, 0), (1.0, 0), (3.0, 1), (8.0, 1)])
+def test_an_autopilot_that_reboots_in_a_bend(compiled: bool, silence_s: float, resets: int) -> None:
+    """It comes back with the vehicle turned by up to 90 deg. A heading that is lost is found anew; nothing is blamed."""
+    truth = bend()
+    fusion = fuse(config(), without(silence_s, measurements(truth)), compiled)
+    head = fusion.history.head
+    assert (head.stamps[PHASE], head.stamps[RESETS]) == (RUNNING, resets)
+    np.testing.assert_allclose(head.nominal[POSITION_E], truth.position_e[-1], atol=2.0)
+    np.testing.assert_allclose(head.nominal[VELOCITY_E], truth.velocity_e[-1], atol=0.3)
+    off = attitude(fusion)[2] - math.degrees(HEADING + 0.2 * 18.0)
+    assert abs((off + 180) % 360 - 180) < 2.5
+    assert {belief.status for belief in fusion.beliefs(int(head.stamps[T])).values()} <= {"nominal", "noisy"}
+
+
+def test_a_reboot_on_the_spot_costs_nothing(compiled: bool) -> None:
+    """What rests does not turn: a parked vehicle keeps its heading, however long the autopilot is away."""
+    truth = drive(18.0, lambda t: 0 * t, lambda t: HEADING + 0 * t, rate=50.0)
+    fusion = fuse(config(filter=GIVEN), without(10.0, measurements(truth)), compiled)
+    head = fusion.history.head
+    assert (head.stamps[PHASE], head.stamps[RESETS]) == (RUNNING, 0)
+    assert attitude(fusion)[2] == pytest.approx(math.degrees(HEADING), abs=2.0)
+
+
+def test_a_lost_heading_is_not_found_by_coasting(compiled: bool) -> None:
+    """GNSS that is back before the IMU tells where the vehicle is, and how fast; not where it heads."""
+    truth = bend()
+    imu_less = [e for e in measurements(truth) if e.t_ns < T0 + 6 * SECOND or not isinstance(e.payload, ImuSample)]
+    back = [event for event in without(4.0, imu_less) if event.t_ns < T0 + 12 * SECOND]
+    fusion = fuse(config(), [event for event in back if event.t_ns < T0 + 10 * SECOND], compiled)
+    before = yaw_variance(fusion.history.head)
+    assert before > math.radians(20.0) ** 2
+    for event in back:
+        if event.t_ns >= T0 + 10 * SECOND:
+            fusion.take(event)
+    head = fusion.history.head
+    assert head.stamps[RESETS] == 0
+    assert yaw_variance(head) >= before
+    at = truth.at(11.9)
+    assert np.linalg.norm(head.nominal[POSITION_E] - truth.position_e[at]) < 5.0
+    assert np.linalg.norm(head.nominal[VELOCITY_E] - truth.velocity_e[at]) < 1.0
+
+
+@needs_compiled
+def test_kernels_agree_over_a_reboot() -> None:
+    """Coasting, a lost heading that GNSS is not to tell, the start anew."""
+    events = without(3.0, measurements(bend()))
+    one, other = (fuse(config(), events, compiled).history.head for compiled in (True, False))
+    np.testing.assert_array_equal(one.whole, other.whole)
+    np.testing.assert_allclose(one.nominal[:3], other.nominal[:3], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(one.nominal[3:], other.nominal[3:], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_a_given_heading_is_that_of_the_start(compiled: bool) -> None:
+    """Whoever has driven since does not head there any more."""
+    truth = bend()
+    fusion = fuse(config(filter=GIVEN), without(3.0, measurements(truth)), compiled)
+    off = attitude(fusion)[2] - math.degrees(HEADING + 0.2 * 18.0)
+    assert fusion.history.head.stamps[RESETS] == 1
+    assert abs((off + 180) % 360 - 180) < 2.5
 
 
 def test_calibration_survives_a_gap(compiled: bool) -> None:

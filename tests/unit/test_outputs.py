@@ -364,7 +364,7 @@ def test_a_hole_in_the_data_is_told(tmp_path: Path) -> None:
     player.play(2.0)
     player.play(2.0, begin_s=7.0)
     texts = [message.text for message in player.told if isinstance(message, EventMessage)]
-    assert "state reset: a hole in the data of more than 3 s; aligning anew" in texts
+    assert "state reset: more than 3 s without data, or without the IMU until the heading was lost; aligning anew" in texts
     assert "imu0: nothing received for 2 s" in texts
 
 

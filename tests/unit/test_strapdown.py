@@ -26,7 +26,7 @@ from fusiond.state import (
     VELOCITY_E,
     FilterState,
 )
-from fusiond.strapdown import COAST_ACCEL, COAST_RATE
+from fusiond.strapdown import COAST_ACCEL, COAST_TILT, COAST_TURN
 from fusiond.update import inject
 from tests.streams import EARTH_RATE_E, MS, MUNICH, SECOND, T0, config, fuse, running_state, triple
 
@@ -254,6 +254,7 @@ def test_transition_against_finite_differences(kernel: AnyKernel, seed: int) -> 
 def test_coasting_against_finite_differences(compiled: bool) -> None:
     state = running_state(np.random.default_rng(4))
     state.stamps[1] = T0 - 10 * SECOND  # the IMU is long silent
+    state.nominal[3:6] *= 0.1  # so that turns, by which a velocity turns along, are little noise
     kernel = make_kernel(plan(config(imu=QUIET)), compiled)
 
     def carry(moved: FilterState) -> None:
@@ -290,13 +291,24 @@ def test_process_noise(compiled: bool) -> None:
 
 
 def test_coasting_noise(compiled: bool) -> None:
+    """From nothing, over a second: white acceleration, white tilt, and a white turn about the vertical by which the velocity
+    turns along. All by their integrals."""
     state = Path(MUNICH, 10.0).state()
     state.stamps[:2], state.stamps[9] = (T0, T0 - 10 * SECOND), 2
     make_kernel(plan(config()), compiled).predict(state, T0 + SECOND)
-    sigma = np.sqrt(np.diag(state.covariance))
-    np.testing.assert_allclose(sigma[VELOCITY], COAST_ACCEL)
-    np.testing.assert_allclose(sigma[ATTITUDE], COAST_RATE)
-    np.testing.assert_allclose(sigma[POSITION], COAST_ACCEL / math.sqrt(3))
+    up = state.nominal[:3] / np.linalg.norm(state.nominal[:3])
+    sideways = np.cross(up, state.nominal[3:6])
+    assert np.linalg.norm(sideways) > 5.0
+    turns = COAST_TURN**2 * np.outer(sideways, sideways)
+    p, accel = state.covariance, COAST_ACCEL**2 * np.eye(3)
+    tilt = COAST_TILT**2 * np.eye(3)
+    np.testing.assert_allclose(p[ATTITUDE, ATTITUDE], tilt + COAST_TURN**2 * np.outer(up, up), atol=1e-12)
+    np.testing.assert_allclose(p[VELOCITY, VELOCITY], accel + turns, atol=1e-9)
+    np.testing.assert_allclose(p[VELOCITY, ATTITUDE], COAST_TURN**2 * np.outer(sideways, up), atol=1e-9)
+    np.testing.assert_allclose(p[POSITION, VELOCITY], (accel + turns) / 2, atol=1e-9)
+    np.testing.assert_allclose(p[POSITION, ATTITUDE], COAST_TURN**2 * np.outer(sideways, up) / 2, atol=1e-9)
+    np.testing.assert_allclose(p[POSITION, POSITION], (accel + turns) / 3, atol=1e-9)
+    np.testing.assert_array_equal(p, p.T)
 
 
 def test_covariance_stays_symmetric_and_positive_definite(compiled: bool) -> None:
