@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import gc
 import math
 import os
 import sys
@@ -148,7 +147,6 @@ def _seed(text: str) -> int:
 
 def run_daemon(arguments: argparse.Namespace) -> None:
     """fusiond run"""
-    gc.disable()  # what is imported now stays; once up the estimator collects
     from fusiond.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
 
     journal.set_up()
