@@ -23,7 +23,7 @@ from fusiond import alignment, bank, health
 from fusiond.answer import answer
 from fusiond.earth import Array
 from fusiond.measure import factor_of, measure, remember, shared
-from fusiond.motion import carried, constrain, rests, watch
+from fusiond.motion import GNSS_FRESH_NS, carried, constrain, rests, watch
 from fusiond.observe import MODELS, wheel_speed
 from fusiond.observe.model import VALUES
 from fusiond.plan import IMU, MODEL, Plan
@@ -83,7 +83,7 @@ ROW = np.dtype(
 Rows = NDArray[Any]  # structured, of dtype ROW
 
 COAST_RATE_VARIANCE = COAST_RATE * COAST_RATE
-LOST_HEADING = math.radians(20.0)  # sigma, after coasting: the filter does not find back from such errors, but aligns anew
+LOST_HEADING = math.radians(12.0)  # sigma, after coasting: the filter may not find back from such errors, but aligns anew
 LEAST_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 
 
@@ -264,7 +264,7 @@ def step(state: FilterState, rows: Rows, index: int, following_imu: int, plan: P
         advance(state, t_ns, rows[following_imu] if following_imu < len(rows) else None, plan)
         variance = yaw_variance(state) if coasted else 0.0
         lost, model = variance > LOST_HEADING * LOST_HEADING, plan.models[source]
-        if model == IMU and lost:
+        if model == IMU and lost and heard_gnss(state, plan):
             stamps[RESETS] += 1
             alignment.begin(state)
             alignment.gather(state, t_ns, source, values, plan)
@@ -285,6 +285,11 @@ def measure_lost(state: FilterState, row: Any, plan: Plan, variance: float) -> b
     up_e = state.nominal[POSITION_E]
     state.covariance[ATTITUDE, ATTITUDE] += np.outer(up_e, up_e) * (told / float(up_e @ up_e))
     return fused
+
+
+def heard_gnss(state: FilterState, plan: Plan) -> bool:
+    """Whether GNSS told velocities until the IMU fell silent, and so will again: without it an alignment would not end."""
+    return any(state.stamps[T_IMU] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS for i in plan.velocities)
 
 
 def yaw_variance(state: FilterState) -> float:

@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.estimate import Mode
 from fusiond.fusion import Fusion
-from fusiond.kernel import Outcome, yaw_variance
+from fusiond.kernel import LOST_HEADING, Outcome, yaw_variance
 from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.rotation import euler, matrix, matrix_from_euler
 from fusiond.state import (
@@ -178,7 +178,7 @@ def later(events: list[Measurement], shift_ns: int) -> list[Measurement]:
     ]
 
 
-@pytest.mark.parametrize(("gap_s", "resets"), [(7200.0, 1), (31.0, 1), (20.0, 1), (0.5, 0)])
+@pytest.mark.parametrize(("gap_s", "resets"), [(7200.0, 1), (31.0, 1), (20.0, 1), (0.3, 0)])
 def test_starts_again_after_a_gap(compiled: bool, gap_s: float, resets: int) -> None:
     """It went on another way while nothing was heard; when its heading is lost, and after the restart gap, it aligns anew,
     and says that it jumped."""
@@ -210,7 +210,7 @@ def without(silence_s: float, events: list[Measurement]) -> list[Measurement]:
     return [event for event in events if event.t_ns not in silent or isinstance(event.payload, WheelSpeed)]
 
 
-@pytest.mark.parametrize(("silence_s", "resets"), [(0.5, 0), (1.0, 0), (3.0, 1), (8.0, 1)])
+@pytest.mark.parametrize(("silence_s", "resets"), [(0.4, 0), (1.0, 1), (3.0, 1), (8.0, 1)])
 def test_an_autopilot_that_reboots_in_a_bend(compiled: bool, silence_s: float, resets: int) -> None:
     """It comes back with the vehicle turned by up to 90 deg. A heading that is lost is found anew; nothing is blamed."""
     truth = bend()
@@ -240,7 +240,7 @@ def test_a_lost_heading_is_not_found_by_coasting(compiled: bool) -> None:
     back = [event for event in without(4.0, imu_less) if event.t_ns < T0 + 12 * SECOND]
     fusion = fuse(config(), [event for event in back if event.t_ns < T0 + 10 * SECOND], compiled)
     before = yaw_variance(fusion.history.head)
-    assert before > math.radians(20.0) ** 2
+    assert before > LOST_HEADING**2
     for event in back:
         if event.t_ns >= T0 + 10 * SECOND:
             fusion.take(event)
@@ -261,6 +261,14 @@ def test_kernels_agree_over_a_reboot() -> None:
     np.testing.assert_allclose(one.nominal[:3], other.nominal[:3], rtol=0, atol=1e-6)
     np.testing.assert_allclose(one.nominal[3:], other.nominal[3:], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_a_silent_imu_in_a_tunnel(compiled: bool) -> None:
+    """Without GNSS nothing finds the heading: as it is, far less certain, it is better than none."""
+    events = [e for e in without(1.0, measurements(bend())) if e.t_ns < T0 + 3 * SECOND or not e.source.startswith("gps0")]
+    head = fuse(config(), events, compiled).history.head
+    assert (head.stamps[PHASE], head.stamps[RESETS]) == (RUNNING, 0)
+    assert yaw_variance(head) > LOST_HEADING**2
 
 
 def test_a_given_heading_is_that_of_the_start(compiled: bool) -> None:
