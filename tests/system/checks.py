@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench import BOX, DEADLINE_S, INTERFACE, SECOND, UNIT, URGENT, Bench, Failed, call, wait
+from bench import BOX, DEADLINE_S, INTERFACE, SECOND, UNIT, URGENT, Bench, Failed, call, libraries_s, wait
 from faults import FAULTS
 from reader import Truth, reading
 from vehicle import Vehicle
@@ -190,7 +190,7 @@ def run_through(checks: Checks, folder: Path) -> None:
     prepare(folder)
     vehicle = Vehicle(folder, "drive.tlog", "drive.log", INTERFACE, PORT, counted_id=0x1D0)
     with reading("bench", ENDPOINT) as reader:
-        bench = Bench(vehicle, reader, Truth(folder / "truth.csv"))
+        bench = Bench(vehicle, reader, Truth(folder / "truth.csv"), libraries_s=libraries_s())
 
         def begin() -> str:
             ready_s = start(UNIT)
