@@ -1,6 +1,6 @@
 """Is the filter as wrong as it says, and as right as it could be: NEES, NIS and the Cramer-Rao bound in the nominal drive.
 
-The filter is started off the truth by a draw of the covariance that it is told. It is looked at once a second, just before
+The filter is begun off the truth by a draw of the covariance that it is told. It is looked at once a second, just before
 a fix, when no fix is on its way, so that it has everything that the bound has.
 """
 
@@ -15,10 +15,9 @@ from scipy.stats import chi2
 from benchmarks.study import nominal
 from benchmarks.study.bound import Bound
 from benchmarks.study.report import Section, figure
-from benchmarks.study.runs import BLOCKS, Ledger, drive, error, spread, started
+from benchmarks.study.runs import BLOCKS, Ledger, begun, drive, error, spread
 from benchmarks.study.world import Sensors, World
 from fusiond.earth import Array
-from fusiond.fusion import Fusion
 from fusiond.plan import IMU
 from fusiond.sections import Config
 from fusiond.state import CONSTRAINT_RATIO
@@ -83,8 +82,7 @@ def least(config: Config, rounds: int, seed: list[int]) -> Array:
 
 def one(config: Config, rounds: int, seed: list[int]) -> Run:
     random = np.random.default_rng(seed)
-    world, fusion = World(nominal.scenario(rounds, imu_hz=IMU_HZ), config, random), Fusion(config, compiled=True)
-    started(fusion, world, random)
+    world, fusion = begun(nominal.scenario(rounds, imu_hz=IMU_HZ), config, random)
     ledger, constraint = Ledger(fusion), fusion.plan.gates[2]
     errors, claimed = [], []
     nis: dict[str, list[float]] = {CONSTRAINT: []}

@@ -8,9 +8,8 @@ import numpy as np
 
 from benchmarks.study import nominal
 from benchmarks.study.report import Section
-from benchmarks.study.runs import drive, error, spread, started
-from benchmarks.study.world import GNSS_NAME, T0, Fault, Sensors, World
-from fusiond.fusion import Fusion
+from benchmarks.study.runs import begun, drive, error, spread
+from benchmarks.study.world import GNSS_NAME, T0, Fault, Sensors
 from fusiond.plan import nanoseconds
 from fusiond.state import POSITION, RESETS
 
@@ -68,8 +67,7 @@ def watched(
 ) -> Watched:  # fmt: skip
     """Drive a course so many times, and ask every LOOK_S what is believed."""
     random, config = np.random.default_rng(seed), nominal.config(**changes)
-    world, fusion = World(nominal.scenario(rounds, course=course, imu_hz=IMU_HZ), config, random), Fusion(config, True)
-    started(fusion, world, random)
+    world, fusion = begun(nominal.scenario(rounds, course=course, imu_hz=IMU_HZ), config, random)
     looks = np.arange(LOOK_S, world.t[-1], LOOK_S).tolist()
     statuses: dict[str, list[str]] = {source: [] for source in fusion.plan.sources}
     errors: list[float] = []

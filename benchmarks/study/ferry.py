@@ -8,9 +8,8 @@ import numpy as np
 
 from benchmarks.study import nominal
 from benchmarks.study.report import Section
-from benchmarks.study.runs import Ledger, drive, error, spread, started
-from benchmarks.study.world import GNSS_NAME, Fault, Sensors, World
-from fusiond.fusion import Fusion
+from benchmarks.study.runs import Ledger, begun, drive, error, spread
+from benchmarks.study.world import GNSS_NAME, Fault, Sensors
 from fusiond.state import POSITION, RESETS, VELOCITY
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
@@ -40,8 +39,7 @@ def one(speed: float, seed: list[int]) -> Passage:
     random = np.random.default_rng(seed)
     config = nominal.config(motion={"standstill": True}, wheel={"unsigned": True, "least_mps": 0.1})
     scenario = nominal.scenario(course=course(speed), imu_hz=IMU_HZ)
-    world, fusion = World(scenario, config, random), Fusion(config, compiled=True)
-    started(fusion, world, random)
+    world, fusion = begun(scenario, config, random)
     ledger, found = Ledger(fusion), []
 
     def look(t: float, k: int) -> None:

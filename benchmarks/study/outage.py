@@ -8,9 +8,8 @@ import numpy as np
 
 from benchmarks.study import nominal
 from benchmarks.study.report import Section, figure
-from benchmarks.study.runs import Ledger, drive, error, spread, started
-from benchmarks.study.world import GNSS_NAME, Fault, Sensors, World
-from fusiond.fusion import Fusion
+from benchmarks.study.runs import Ledger, begun, drive, error, spread
+from benchmarks.study.world import GNSS_NAME, Fault, Sensors
 from fusiond.state import POSITION, RESETS
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
@@ -37,8 +36,7 @@ def one(seconds: float, seed: list[int]) -> Outage:
     random, config = np.random.default_rng(seed), nominal.config()
     end = BEFORE_S + seconds
     scenario = nominal.scenario(int(np.ceil((end + AFTER_S) / 60)), imu_hz=IMU_HZ)
-    world, fusion = World(scenario, config, random), Fusion(config, compiled=True)
-    started(fusion, world, random)
+    world, fusion = begun(scenario, config, random)
     ledger, errors, sigmas = Ledger(fusion), {}, {}
     looks = np.arange(LOOK_S, end + AFTER_S, LOOK_S).tolist()
 

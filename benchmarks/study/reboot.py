@@ -8,9 +8,8 @@ import numpy as np
 
 from benchmarks.study import nominal
 from benchmarks.study.report import Section
-from benchmarks.study.runs import drive, error, spread, started
-from benchmarks.study.world import GNSS_NAME, IMU_NAME, Fault, Sensors, World
-from fusiond.fusion import Fusion
+from benchmarks.study.runs import begun, drive, error, spread
+from benchmarks.study.world import GNSS_NAME, IMU_NAME, Fault, Sensors
 from fusiond.state import ATTITUDE, PHASE, POSITION, RESETS, RUNNING, VELOCITY
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
@@ -35,9 +34,7 @@ def one(seconds: float, seed: list[int]) -> Reboot:
     random, config = np.random.default_rng(seed), nominal.config()
     begin = float(random.uniform(FIRST_S, LAST_S))
     end = begin + seconds
-    world = World(nominal.scenario(2, imu_hz=IMU_HZ), config, random)
-    fusion = Fusion(config, compiled=True)
-    started(fusion, world, random)
+    world, fusion = begun(nominal.scenario(2, imu_hz=IMU_HZ), config, random)
     running: list[float] = []
     errors = (np.inf, np.inf, np.inf)
 

@@ -18,6 +18,8 @@ from fusiond.measurements import Measurement
 from fusiond.motion import watch
 from fusiond.plan import Plan, nanoseconds
 from fusiond.rotation import matrix, quaternion, quaternion_exp, quaternion_multiply
+from fusiond.sections import Config
+from fusiond.simulation.scenario import Scenario
 from fusiond.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
@@ -98,6 +100,13 @@ def true_state(world: World, k: int, plan: Plan) -> FilterState:
     state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = world.rate_b[k] + world.gyro_bias[k]
     state.auxiliary[FORCE_B] = world.force_b[k] + world.accel_bias[k]
     return state
+
+
+def begun(scenario: Scenario, config: Config, random: np.random.Generator) -> tuple[World, Fusion]:
+    """A world, and the compiled filter that runs in it from its first instant on."""
+    world, fusion = World(scenario, config, random), Fusion(config, compiled=True)
+    started(fusion, world, random)
+    return world, fusion
 
 
 def started(fusion: Fusion, world: World, random: np.random.Generator) -> None:
