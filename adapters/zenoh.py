@@ -27,6 +27,7 @@ STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
 KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
 RETRY = {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2}  # of connecting: Zenoh's own is 1 to 4 s
+QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
 TELL_LAST_S = 1.0  # a reader hears within this that it missed the last one
 KIND = {message: kind for kind, message in MESSAGES.items()}
 
@@ -74,6 +75,8 @@ def session_config(section: ZenohSection, directory: str | Path = ".") -> zenoh.
         ("scouting/multicast/enabled", section.multicast_scouting, default.multicast_scouting),
         ("scouting/gossip/enabled", False, False),
         ("connect/retry", RETRY, RETRY),
+        ("transport/link/tx/queue/size/real_time", QUEUED, QUEUED),
+        ("transport/link/tx/queue/size/data", QUEUED, QUEUED),
     ):
         if value != usual or config.get_json(key) == untouched.get_json(key):
             with _explained(f"zenoh: {key} cannot be {value!r}"):
