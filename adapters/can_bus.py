@@ -1,53 +1,48 @@
-"""CAN live: one bus's thread, from python-can to frames in the inbox.
+"""CAN live: one bus's frames, what is made of them, and what its error frames tell.
 
-The bus is opened by python-can's own configuration (files, environment, `config_context`); what [can.NAME] gives goes
-first. Where the interface can filter, only frames of the wheels' ids, and error frames, come in. The kernel's stamp of
-a frame is mapped to the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and
-sets its filters, and `CanSocket` reads it, so that frames lost in the kernel's queue are seen.
+python-can and cantools take as long to import as everything else together, and so only `prepare` does, in the input's
+thread: after a restart the other inputs are fused again, and the state is published, without waiting for them.
 """
 
 from __future__ import annotations
 
 import logging
-import socket
 from collections import Counter
 from threading import Event
-from typing import Any
-
-import can
+from typing import TYPE_CHECKING
 
 from fusiond.measurements import Received
 from fusiond.sections import Config
 
-from .can import EXTENDED, PDU2, CanDecoder
-from .can_socket import CanFrame, CanSocket
+from .can_socket import CanFrame
 from .host_clock import HostClock
-from .inputs import POLL_S, Inbox, InputLost
+from .inputs import Inbox
 
-ID_BITS = 0x1FFFFFFF
-STANDARD_BITS = 0x7FF
-GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # what of a J1939 id tells its PGN, without and with a destination
+if TYPE_CHECKING:
+    from .can import CanDecoder
+    from .can_driver import CanDriver
+
 CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100  # classes of error frames, linux/can/error.h
 OVERFLOW, WARNING, PASSIVE, ACTIVE = 0x03, 0x0C, 0x30, 0x40  # what byte 1 says of the controller
 ERROR_FLAG = 0x20000000  # in an id as candump writes it
-BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
 
 log = logging.getLogger("fusiond")
 
 
 class CanBus:
-    """One [can.NAME]. Raises ConfigError where its DBC files do not fit."""
+    """One [can.NAME]."""
 
     def __init__(self, config: Config, bus: str, inbox: Inbox[CanFrame], clock: HostClock) -> None:
         self.name = bus
         self.file = "can.log"
         self.inbox = inbox
-        self.decoder = CanDecoder(config, bus)
+        self.decoder: CanDecoder | None = None  # until it is prepared
         self.state = "active"  # of the controller, by its error frames
         self.sessions = 0
         self._seen: Counter[str] = Counter()
         self._channel = config.can[bus].log_channel or bus
-        self._clock = clock
+        self._config, self._clock = config, clock
+        self._driver: CanDriver | None = None
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -56,59 +51,21 @@ class CanBus:
         where = " ".join(filter(None, (settings.interface, settings.channel, settings.config_context)))
         self.about = f"CAN {self.name} ({where or 'as python-can is configured'})"
 
+    def prepare(self) -> None:
+        """Load the DBC files. Raises ConfigError where they do not fit."""
+        from .can import CanDecoder  # noqa: PLC0415 - see above
+        from .can_driver import CanDriver  # noqa: PLC0415
+
+        self.decoder = CanDecoder(self._config, self.name)
+        self._driver = CanDriver(self.decoder, self.inbox, self._clock)
+
     def session(self, stop: Event) -> None:
         """Open the bus, read it until told to stop, close it. Raises InputLost."""
-        try:
-            bus = self._open()
-        except (can.CanError, OSError, ValueError, ImportError) as error:
-            raise InputLost(f"cannot be opened: {error}") from error
-        self.sessions += 1
-        self.state = "active"
-        try:
-            opened = getattr(bus, "socket", None)
-            if isinstance(opened, socket.socket) and opened.family == socket.AF_CAN:
-                self._read_socket(CanSocket(opened), stop)
-            while not stop.is_set():
-                message = bus.recv(POLL_S)
-                if message is not None:
-                    self.inbox.put(self._clock.from_wall_ns(round(message.timestamp * 1e9)), _frame(message))
-        except (can.CanError, OSError) as error:
-            raise InputLost(f"lost: {error}") from error
-        finally:
-            bus.shutdown()
-
-    def _read_socket(self, reader: CanSocket, stop: Event) -> None:
-        before = self.inbox.missed
-        while not stop.is_set():
-            for wall_ns, frame in reader.read(POLL_S):
-                self.inbox.put(self._clock.now_ns() if wall_ns is None else self._clock.from_wall_ns(wall_ns), frame)
-            self.inbox.missed = before + reader.dropped
-
-    def _open(self) -> can.BusABC:
-        settings = self._settings
-        more: dict[str, Any] = {"fd": True} if settings.fd else {}
-        if settings.bitrate is not None:
-            more["bitrate"] = settings.bitrate
-        filters = [
-            {
-                "can_id": key & ID_BITS,
-                "can_mask": ID_BITS if key & EXTENDED else STANDARD_BITS,
-                "extended": bool(key & EXTENDED),
-            }
-            for key in sorted(self.decoder.keys)
-        ]
-        filters += [
-            {"can_id": group << 8, "can_mask": GROUP_BITS if group >> 8 & 0xFF >= PDU2 else FORMAT_BITS, "extended": True}
-            for group in sorted(self.decoder.groups)
-        ]
-        bus: can.BusABC = can.Bus(
-            interface=settings.interface,
-            channel=settings.channel,
-            config_context=settings.config_context,
-            can_filters=filters or None,
-            **more,
-        )
-        return bus
+        assert self._driver is not None
+        with self._driver.opened(self._settings) as bus:
+            self.sessions += 1
+            self.state = "active"
+            self._driver.read(bus, stop)
 
     def decode(self, item: CanFrame, t_ns: int) -> list[Received]:
         """The wheels in a frame; an error frame has none, and is counted."""
@@ -118,6 +75,7 @@ class CanBus:
         if item.is_remote:
             self._seen["remote frames"] += 1
             return []
+        assert self.decoder is not None  # no frame comes before
         return self.decoder.decode(item.arbitration_id, item.is_extended, item.data, t_ns)
 
     def _take_error(self, item: CanFrame) -> None:
@@ -157,14 +115,5 @@ class CanBus:
     def counts(self) -> dict[str, int]:
         """What became of the frames so far, and of the bus."""
         own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
-        return {**own, **{name: count for name, count in self._seen.items() if count}, **self.decoder.counts}
-
-
-def _frame(message: can.Message) -> CanFrame:
-    flags = None
-    if message.is_fd:
-        flags = BIT_RATE_SWITCH * message.bitrate_switch + ERROR_STATE * message.error_state_indicator
-    data = b"" if message.is_remote_frame else bytes(message.data)
-    return CanFrame(
-        message.arbitration_id, message.is_extended_id, data, flags, message.is_remote_frame, message.is_error_frame
-    )
+        decoded = self.decoder.counts if self.decoder else {}
+        return {**own, **{name: count for name, count in self._seen.items() if count}, **decoded}

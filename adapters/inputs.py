@@ -51,7 +51,7 @@ class Inbox(Generic[Item]):
 
 
 class LiveInput(Protocol[Item]):
-    """One link or bus. `session` runs in a thread; `decode` and `record` are called by the engine."""
+    """One link or bus. `prepare` and `session` run in a thread; `decode` and `record` are called by the engine."""
 
     name: str
     about: str  # for people
@@ -60,6 +60,9 @@ class LiveInput(Protocol[Item]):
 
     def configure(self, config: Config) -> None:
         """Take what may change while running, for the sessions to come. Raises ConfigError."""
+
+    def prepare(self) -> None:
+        """Load what takes long to load. Once, before the first session. Raises ConfigError."""
 
     def session(self, stop: Event) -> None:
         """Open, read into the inbox until told to stop, close. Raises InputLost."""

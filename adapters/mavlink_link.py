@@ -52,6 +52,9 @@ class MavlinkLink:
         self.about = f"MAVLink {self.name} ({settings.connection})"
         self.talk = MavlinkTalk(config, self.name)
 
+    def prepare(self) -> None:
+        """Nothing takes long."""
+
     def session(self, stop: Event) -> None:
         """Open the link, read it until told to stop, close it. Raises InputLost."""
         try:

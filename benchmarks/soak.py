@@ -104,6 +104,7 @@ def accelerated(settings: Config, seconds: float, published: Published, memory: 
     clock = PlayedClock(BEGIN_NS, 1.0)
     daemon = Daemon(settings, sinks=[published.add], zenoh=False, clock=clock)
     link, bus = daemon.inputs["mavlink.fc"], daemon.inputs["can.car"]
+    bus.prepare()
     with ExitStack() as stack:
         files: dict[str, BinaryIO] = {}
 

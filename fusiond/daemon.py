@@ -53,7 +53,7 @@ class Daemon:
     """One run. `sinks` take every published state, in the estimator's own thread; `outputs` are added to those of the
     configuration, of which `zenoh=False` leaves out Zenoh; `load` reads the configuration anew for a reload.
 
-    Raises ConfigError where the configuration does not fit its DBC files or dialects, or an output lacks its extra.
+    Raises ConfigError where the configuration does not fit its dialects, or an output lacks its extra.
     """
 
     def __init__(
@@ -79,12 +79,13 @@ class Daemon:
         if not zenoh:
             del self.outputs["zenoh"]
         self.published = self.reloads = 0
-        self.up = asyncio.Event()  # the first turn of the estimator is done, and every output has been tried
+        self.up = asyncio.Event()  # every input is prepared, and every output has been tried
         self.health: HealthMessage | None = None  # the latest
         self.estimator = Estimator(self.live, self.inputs, self.clock, self._wake, self._after_turn)
         self._load, self._sinks = load, sinks
         self._stopping = asyncio.Event()
         self._stops: dict[str, Event] = {}  # ends the session of an input
+        self._wrong: ConfigError | None = None  # what an input found when it was prepared
         self._outputs_over = asyncio.Event()  # the estimator has ended: there is no more to come
         self._stop_output = Event()  # and so the sessions of the outputs are to end
         self._recorder: Recorder | None = None
@@ -103,7 +104,8 @@ class Daemon:
             event.set()
 
     async def run(self) -> None:
-        """Run until asked to stop. Raises OSError where the black box's folder cannot be made."""
+        """Run until asked to stop. Raises OSError where the black box's folder cannot be made, ConfigError where the
+        configuration does not fit its DBC files: then nothing was ever said to be up."""
         self._open_recorder()
         if self._recorder and self._state_file and self._state_file.stored:
             self._recorder.add("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
@@ -111,8 +113,9 @@ class Daemon:
         executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="fusiond")
         try:
             async with asyncio.TaskGroup() as group:
+                prepared = {key: asyncio.Event() for key in self.inputs}
                 inputs = [
-                    group.create_task(self._supervise(key, source, executor), name=source.about)
+                    group.create_task(self._supervise(key, source, executor, prepared[key]), name=source.about)
                     for key, source in self.inputs.items()
                 ]
                 estimator = group.create_task(self._estimate(executor), name="estimator")
@@ -121,7 +124,7 @@ class Daemon:
                 tried = {name: asyncio.Event() for name in self.outputs}
                 for name, output in self.outputs.items():
                     group.create_task(self._keep(output, executor, tried[name]), name=output.about)
-                group.create_task(self._come_up(tried.values()))
+                group.create_task(self._come_up([*prepared.values(), *tried.values()]))
                 if self._state_file:
                     group.create_task(self._keep_state(self._state_file, executor), name="state file")
         finally:
@@ -133,6 +136,8 @@ class Daemon:
             if self._recorder:
                 self._recorder.close()
             self._notifier.close()
+        if self._wrong:
+            raise self._wrong
         log.info("ended: %s", self.status(), extra={"MESSAGE_ID": journal.ENDED})
 
     # --- Inputs
@@ -148,13 +153,23 @@ class Daemon:
     def _is_alive(self) -> bool:
         return self.estimator.is_alive()
 
-    async def _supervise(self, key: str, source: LiveInput[Any], executor: ThreadPoolExecutor) -> None:
-        """Keep an input open until the daemon is to stop."""
+    async def _supervise(
+        self, key: str, source: LiveInput[Any], executor: ThreadPoolExecutor, prepared: asyncio.Event
+    ) -> None:
+        """Prepare an input, and keep it open until the daemon is to stop."""
+        loop = asyncio.get_running_loop()
 
         async def session() -> None:
             stop = self._stops[key] = Event()
-            await asyncio.get_running_loop().run_in_executor(executor, _run, key, source.session, stop)
+            await loop.run_in_executor(executor, _run, key, source.session, stop)
 
+        try:
+            await loop.run_in_executor(executor, _run, key, source.prepare)
+        except ConfigError as wrong:
+            self._wrong = wrong
+            self.stop()
+        finally:
+            prepared.set()
         await self._keep_open(source, session, self._stopping)
 
     async def _keep_open(
@@ -262,9 +277,11 @@ class Daemon:
         for output in self.outputs.values():
             output.outbox.rouse()
 
-    async def _come_up(self, tried: Iterable[asyncio.Event]) -> None:
-        for event in tried:
+    async def _come_up(self, parts_done: Iterable[asyncio.Event]) -> None:
+        for event in parts_done:
             await event.wait()
+        if self._wrong:
+            return
         self.up.set()
         self._notifier.ready(self.status())
         parts = [source.about for source in self.inputs.values()] + [output.about for output in self.outputs.values()]
@@ -329,7 +346,8 @@ class Daemon:
         self._notifier.reloading()
         try:
             new = self._load()
-            self._make_inputs(new)  # raises what is wrong with it, before anything is changed
+            for source in self._make_inputs(new).values():  # raises what is wrong with it, before anything is changed
+                source.prepare()
             found = changes(self.config, new)
             if found.refused:
                 log.error("reload refused: a restart is needed to change %s", ", ".join(found.refused))

@@ -127,7 +127,8 @@ def _play(settings: Config, speed: float) -> Played:
         daemon = Daemon(settings, sinks=[states.append], zenoh=False, clock=clock)
         asyncio.run(_run_while_played(daemon, player))
     received = sum(source.inbox.received for source in daemon.inputs.values())
-    wanted = {key for source in daemon.inputs.values() if isinstance(source, CanBus) for key in source.decoder.keys}
+    decoders = [source.decoder for source in daemon.inputs.values() if isinstance(source, CanBus)]
+    wanted = {key for decoder in decoders if decoder for key in decoder.keys}
     sent = player.sent_mavlink + sum(count for number, count in player.sent_can.items() if number in wanted)
     return Played(
         rows=[csv_row(state) for state in states],

@@ -24,6 +24,7 @@ from fusiond.estimate import Mode
 from fusiond.messages import StateMessage, encode
 from fusiond.replay import Replay, Wants
 from fusiond.sections import Config
+from fusiond_adapters.can_bus import CanBus
 from fusiond_adapters.logs.merge import open_logs
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
@@ -100,6 +101,30 @@ def test_udp_and_can_align_and_publish(tmp_path: Path, channel: str, bus: can.Bu
     assert periods == {10_000_000}
     totals = run.daemon.live.engine.fusion.totals()
     assert sum(totals.values()) == run.daemon.live.offered  # nothing unaccounted for
+
+
+def test_an_input_that_takes_long_to_prepare_holds_up_nothing_else(
+    tmp_path: Path, channel: str, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, loaded, prepare = free_port(), Event(), CanBus.prepare
+
+    def slow(wheels: CanBus) -> None:
+        assert loaded.wait(DEADLINE)
+        prepare(wheels)
+
+    monkeypatch.setattr(CanBus, "prepare", slow)
+    settings = configuration(tmp_path, f"udpin:127.0.0.1:{port}", channel=channel)
+    with running(settings) as run, closing(udp(port)[0]) as peer:
+        autopilot, daemon = Autopilot(), run.daemon
+
+        def send(data: bytes) -> int:
+            return peer.sendto(data, ("127.0.0.1", port))
+
+        drive(run, send, bus, lambda: aligned(run), autopilot)
+        assert not daemon.up.is_set()
+        loaded.set()
+        drive(run, send, bus, lambda: fused(run, "left") > 0, autopilot)
+        run.until(daemon.up.is_set)
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("udpin", "udpout"), ("tcpin", "tcp")])

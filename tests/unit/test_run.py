@@ -85,3 +85,18 @@ def test_wrong_configuration_is_exit_code_2(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, check=False)
     assert done.returncode == 2
     assert "mavlink.fc.connection: 'udpin:14550': HOST:PORT is wanted" in done.stderr
+
+
+def test_a_dbc_that_does_not_fit_is_exit_code_2_and_never_up(tmp_path: Path, manager: socket.socket) -> None:
+    more = f'[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"]\n'
+    configuration(tmp_path, f"udpin:127.0.0.1:{free_port(socket.SOCK_DGRAM)}", more)
+    (tmp_path / "axle.dbc").write_text((tmp_path / "axle.dbc").read_text().replace("LEFT", "PORT"))
+    command = [sys.executable, "-m", "fusiond", "run", "--config", str(tmp_path / "live.toml")]
+    environment = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=DEADLINE, check=False)
+    assert done.returncode == 2
+    assert "wheel.left.signal: there is no signal of AXLE 'LEFT' in the DBC" in done.stderr
+    assert "Traceback" not in done.stderr
+    manager.settimeout(0)
+    with pytest.raises(BlockingIOError):
+        told(manager, "READY=1")
