@@ -32,6 +32,7 @@ EXPOSURE = 2.0  # the most that systemd may find
 TRACE_RMSE_M = 1.0  # of the captured trace: 0.31 m replayed
 READY_S = 15.0
 MISSING_SHARE = 0.02  # of the states: a reader that is slow on a slow machine
+STOOD_STILL_S = 1.0  # a machine that did so long tells nothing about the service
 
 
 class Check(NamedTuple):
@@ -185,6 +186,18 @@ def prepare(folder: Path) -> None:
     make_interface(INTERFACE)
 
 
+def tried(fault: Callable[[Bench], str], bench: Bench) -> str:
+    """Try a fault; once more if that failed while the machine itself stood still, by what the vehicle was late."""
+    bench.vehicle.late_ns = 0
+    try:
+        return fault(bench)
+    except Failed as failed:
+        stood_s = bench.vehicle.late_ns / SECOND
+        if stood_s < STOOD_STILL_S:
+            raise
+        return f"{fault(bench)} (at the second try; before, while the machine stood still for {stood_s:.1f} s: {failed})"
+
+
 def run_through(checks: Checks, folder: Path) -> None:
     """The service on its drive, and then every fault."""
     prepare(folder)
@@ -207,7 +220,7 @@ def run_through(checks: Checks, folder: Path) -> None:
 
         if checks.run("states over Zenoh", begin):
             for name, fault in FAULTS:
-                checks.run(name, lambda fault=fault: fault(bench))  # type: ignore[misc]
+                checks.run(name, lambda fault=fault: tried(fault, bench))  # type: ignore[misc]
             vehicle.end()
     checks.run("journal", lambda: journal_fields(UNIT))
 
