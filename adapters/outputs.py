@@ -2,6 +2,7 @@
 
 Each output sends in a thread of its own, so that a consumer that is slow or dead holds up neither the estimator nor
 another output. When the outbox of an output is full the oldest message is dropped and counted: what is new is worth more.
+An output whose sending never waits may have states handed to it at once instead, without the way through its thread.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ class Outbox:
     def __init__(self, size: int, wants: tuple[type[Message], ...]) -> None:
         """`wants` are the kinds of messages that are let in."""
         self.offered = self.dropped = 0
-        self.latency = RecentLatencies()  # from the instant of a state to its being taken
+        self.latency = RecentLatencies()  # from the instant of a state to its being taken, or sent at once
+        self.at_once: Callable[[StateMessage], bool] | None = None
+        """Sends a state in the estimator's thread, and never waits. False: it cannot just now, and the state is queued."""
         self._wants = wants
         self._messages: deque[Message] = deque(maxlen=size)
         self._filled = Condition()
@@ -47,6 +50,12 @@ class Outbox:
     def put(self, message: Message) -> None:
         """Leave a message, if it is of a wanted kind. Never waits for the reader."""
         if not isinstance(message, self._wants):
+            return
+        if type(message) is StateMessage and (send := self.at_once) and send(message):
+            with self._filled:
+                self.offered += 1
+            if self._now:
+                self.latency.add(max(0, self._now() - message.t_ns))
             return
         with self._filled:
             self.offered += 1

@@ -77,6 +77,7 @@ def session_config(section: ZenohSection, directory: str | Path = ".") -> zenoh.
         ("connect/retry", RETRY, RETRY),
         ("transport/link/tx/queue/size/real_time", QUEUED, QUEUED),
         ("transport/link/tx/queue/size/data", QUEUED, QUEUED),
+        ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", 0, 0),
     ):
         if value != usual or config.get_json(key) == untouched.get_json(key):
             with _explained(f"zenoh: {key} cannot be {value!r}"):

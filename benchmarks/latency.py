@@ -362,7 +362,7 @@ async def measure(folder: Path, seconds: float) -> tuple[Reading, str]:
     lines = []
     for name, latency in (("receipt to fused", health.latency_ms.fused), ("tick to outputs", health.latency_ms.published)):
         lines.append(f"inside, {name}: {latency}")
-    lines.append(f"inside, tick to Zenoh's thread: {health.outputs['zenoh'].latency_ms}")
+    lines.append(f"inside, tick to Zenoh: {health.outputs['zenoh'].latency_ms}")
     spent = {name: ms - before.get(name, 0.0) for name, ms in after.items()}
     lines += ["", f"CPU, in percent of one core: {100 * sum(spent.values()) / took_ms:.1f}"]
     lines += [f"  {100 * ms / took_ms:5.1f}  {name}" for name, ms in sorted(spent.items(), key=lambda item: -item[1])]
