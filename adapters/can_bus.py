@@ -1,7 +1,7 @@
 """CAN live: one bus's frames, what is made of them, and what its error frames tell.
 
-python-can and cantools take as long to import as everything else together, and so only `prepare` does, in the input's
-thread: after a restart the other inputs are fused again, and the state is published, without waiting for them.
+python-can and cantools are slow to import, and so only `prepare` does, in the input's thread: after a restart the other
+inputs are fused again, and the state is published, without waiting for them.
 """
 
 from __future__ import annotations

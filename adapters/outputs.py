@@ -51,14 +51,13 @@ class Outbox:
         """Leave a message, if it is of a wanted kind. Never waits for the reader."""
         if not isinstance(message, self._wants):
             return
+        with self._filled:
+            self.offered += 1
         if type(message) is StateMessage and (send := self.at_once) and send(message):
-            with self._filled:
-                self.offered += 1
             if self._now:
                 self.latency.add(max(0, self._now() - message.t_ns))
             return
         with self._filled:
-            self.offered += 1
             self.dropped += len(self._messages) == self._messages.maxlen
             self._messages.append(message)
             self._filled.notify()

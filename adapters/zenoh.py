@@ -1,7 +1,7 @@
 """Zenoh: a session that keeps to itself unless told otherwise, and the publishers of all messages.
 
 A session hears and speaks on loopback only, by default: no multicast scouting, no gossip, no listener on other
-interfaces. Publishing never waits. Streams (state, settled, innovations) lose samples when a reader cannot keep up. What is
+interfaces. Publishing hardly waits. Streams (state, settled, innovations) lose samples when a reader cannot keep up. What is
 told seldom (health, events, info, config) is kept here: readers that find one missing, or come late, fetch it.
 """
 
@@ -28,7 +28,9 @@ PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TI
 KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
 RETRY = {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2}  # of connecting: Zenoh's own is 1 to 4 s
 QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
+PATIENCE_US = 1000  # with which a sample waits for room there, as Zenoh has it
 TELL_LAST_S = 1.0  # a reader hears within this that it missed the last one
+WAIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
 KIND = {message: kind for kind, message in MESSAGES.items()}
 
 CONTENT_TYPES: dict[Encoding, str] = {"json": "application/json", "msgpack": "application/msgpack"}
@@ -53,15 +55,18 @@ def alive_key(vehicle: str) -> str:
     return f"fusiond/{vehicle}/@alive/state"
 
 
-def open_session(section: ZenohSection, directory: str | Path = ".") -> zenoh.Session:
-    """A session as configured; close it (it is a context manager) after its publishers. Raises PublishError."""
-    config = session_config(section, directory)
+def open_session(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Session:
+    """A session as configured; close it (it is a context manager) after its publishers. Raises PublishError.
+
+    Publishing waits for a reader whose queue is full PATIENCE_US, before it drops the sample; not at all unless `patient`.
+    """
+    config = session_config(section, directory, patient=patient)
     what = f"zenoh: cannot open a {section.mode}, listen {section.listen}, connect {section.connect}"
     with _explained(what):
         return zenoh.open(config)
 
 
-def session_config(section: ZenohSection, directory: str | Path = ".") -> zenoh.Config:
+def session_config(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Config:
     """Zenoh's configuration: its own file first (relative to `directory`), then the section. Raises PublishError.
 
     A key of the section that is left at its default yields to the file, where the file says other than Zenoh's default.
@@ -77,7 +82,7 @@ def session_config(section: ZenohSection, directory: str | Path = ".") -> zenoh.
         ("connect/retry", RETRY, RETRY),
         ("transport/link/tx/queue/size/real_time", QUEUED, QUEUED),
         ("transport/link/tx/queue/size/data", QUEUED, QUEUED),
-        ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", 0, 0),
+        (WAIT, PATIENCE_US if patient else 0, PATIENCE_US),
     ):
         if value != usual or config.get_json(key) == untouched.get_json(key):
             with _explained(f"zenoh: {key} cannot be {value!r}"):
@@ -146,7 +151,7 @@ class ZenohPublisher:
         return bool(status.matching)
 
     def publish(self, message: Message) -> None:
-        """Send a message to whoever subscribes. Never waits. Raises PublishError where the session is closed."""
+        """Send a message to whoever subscribes. Raises PublishError where the session is closed."""
         where = message_key(message, self.vehicle)
         payload = encode(message, self._encoding)
         if self._closed:

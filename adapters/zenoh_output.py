@@ -40,7 +40,7 @@ class ZenohOutput:
         config = self._config
         try:
             with (
-                open_session(config.zenoh, config.directory) as session,
+                open_session(config.zenoh, config.directory, patient=False) as session,
                 ZenohPublisher(session, config.vehicle.name, config.publish.encoding) as publisher,
                 self.answers.declared(session),
             ):

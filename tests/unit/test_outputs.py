@@ -280,6 +280,26 @@ def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[Config, Path, 
         }
 
 
+def test_a_state_goes_at_once_where_the_output_can_and_waits_where_it_cannot(
+    recorded: tuple[Config, Path, list[Message], Running],
+) -> None:
+    first, second, *_ = (message for message in recorded[2] if isinstance(message, StateMessage))
+    sent: list[StateMessage] = []
+
+    def send(state: StateMessage) -> bool:
+        if able := state is first:
+            sent.append(state)
+        return able
+
+    outbox = Outbox(3, (StateMessage, EventMessage))
+    outbox.attend(lambda: first.t_ns + 7, lambda: None)
+    outbox.at_once = send
+    for message in (first, event("queued"), second):
+        outbox.put(message)
+    assert (sent, outbox.take(0), outbox.offered, outbox.dropped) == ([first], [event("queued"), second], 3, 0)
+    assert outbox.latency.count == 2
+
+
 def test_info_and_config_say_what_runs(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     settings, _, messages, _ = recorded
     info = next(message for message in messages if isinstance(message, InfoMessage))

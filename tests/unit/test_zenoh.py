@@ -189,6 +189,17 @@ def test_by_default_only_loopback_is_used_and_nothing_scouts() -> None:
     assert json.loads(config.get_json("mode")) == "peer"
 
 
+def test_a_burst_waits_and_an_impatient_publisher_does_not(tmp_path: Path) -> None:
+    queue = "transport/link/tx/queue"
+    for patient, wait_us in ((True, 1000), (False, 0)):
+        config = session_config(Zenoh(), patient=patient)
+        assert json.loads(config.get_json(f"{queue}/size/real_time")) == 16
+        assert json.loads(config.get_json(f"{queue}/congestion_control/drop/wait_before_drop")) == wait_us
+    (tmp_path / "own.json5").write_text("{transport: {link: {tx: {queue: {size: {real_time: 4}}}}}}")
+    own = session_config(Zenoh(config_file="own.json5"), tmp_path)
+    assert json.loads(own.get_json(f"{queue}/size/real_time")) == 4
+
+
 def test_zenohs_own_file_rules_where_the_section_is_silent(tmp_path: Path) -> None:
     (tmp_path / "own.json5").write_text('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, /* mine */}')
     config = session_config(Zenoh(config_file="own.json5"), tmp_path)
