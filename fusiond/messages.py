@@ -209,7 +209,7 @@ class OutputHealth(Message, frozen=True, kw_only=True):
     offered: Annotated[int, _about("messages left for it")]
     dropped: Annotated[int, _about("messages dropped, the oldest first, because it was slow or away")]
     latency_ms: Annotated[
-        Quantiles | None, _about("from the instant of a publication to its being taken up or sent by this output; null before")
+        Quantiles | None, _about("from the instant of a publication to its being sent or taken up here; null before")
     ] = None
     counts: Annotated[dict[str, int], _about("what became of the others, by kind")]
     notes: Annotated[dict[str, str], _about("what else there is to tell, such as whether the autopilot uses it")]
