@@ -160,7 +160,7 @@ def soak(seconds: float, out: Path, *, real_time: bool) -> bool:
     """Run, tell what was found, and whether it is as it should be."""
     settings = configuration(out, free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM))
     memory, digests = Memory(seconds), out / "digests"
-    with TemporaryDirectory(dir=out) as box:
+    with TemporaryDirectory(dir=out.resolve()) as box:  # a relative folder would be relative to the configuration
         with digests.open("wb") as file:
             published = Published(file)
             begin = time.monotonic()
