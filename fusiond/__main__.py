@@ -147,7 +147,7 @@ def _seed(text: str) -> int:
 
 def run_daemon(arguments: argparse.Namespace) -> None:
     """fusiond run"""
-    import numpy  # noqa: F401, PLC0415 - here, not from deep within: Python's stack would grow and shrink 3000 times
+    import numpy  # noqa: F401, PLC0415 - here, not from deep within: there Python maps and unmaps its stack at every call
 
     from fusiond.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
 
