@@ -23,7 +23,7 @@ IN_TIME_NS = 20_000_000  # a vehicle that is farther behind sends no copies
 BOOT_S = 3.0  # a rebooting autopilot says nothing for so long
 RETRY_NS = SECOND // 10  # between two attempts to open a CAN interface that is away
 LISTEN_NS = SECOND // 20  # between two looks at what fusiond said
-HEADER_2, MAGIC_2, IMU = 10, 0xFD, b"\x69\0\0"  # MAVLink 2: size and first byte of a frame, id of HIGHRES_IMU
+HEADER_2, IMU = 10, b"\x69\0\0"  # MAVLink 2: size of a frame's header, id of HIGHRES_IMU
 IMU_EXTRA = bytes([common.MAVLink_highres_imu_message.crc_extra])
 STAMP = struct.Struct("<Q")  # time_usec: HIGHRES_IMU's first field
 COUNTER = 0x07  # the bits of a wheel frame's last byte that count
@@ -100,7 +100,7 @@ class Vehicle(Thread):
             self._listen()
         if now < self._silent_until_ns:
             return
-        if frame[0] == MAGIC_2 and frame[7:HEADER_2] == IMU:
+        if frame[7:HEADER_2] == IMU:
             self._send_imu(bytearray(frame))
             return
         message = self._ear_decode(frame)
@@ -113,15 +113,11 @@ class Vehicle(Thread):
             message.time_unix_usec += self._unix_shift_us
         elif kind == "GPS_RAW_INT":
             message.time_usec += self._unix_shift_us
-        elif kind == "HIGHRES_IMU":
-            self._time_us = message.time_usec
-            message.time_usec -= self._boot_us
         stamp = getattr(message, "time_usec", None)
         for copy in range(self._copies):
             if stamp is not None:
                 message.time_usec = self._spread(stamp, copy)
-            self._write(bytes(message.pack(self._voice)))
-            self._voice.seq = (self._voice.seq + 1) & 0xFF
+            self._speak(bytes(message.pack(self._voice)))
 
     def _send_imu(self, frame: bytearray) -> None:
         """The same for most of the frames, without decoding them."""
@@ -130,8 +126,11 @@ class Vehicle(Thread):
             STAMP.pack_into(frame, HEADER_2, self._spread(self._time_us - self._boot_us, copy))
             frame[4] = self._voice.seq
             frame[-2:] = mcrf4xx(bytes(frame[1:-2]) + IMU_EXTRA).to_bytes(2, "little")
-            self._write(bytes(frame))
-            self._voice.seq = (self._voice.seq + 1) & 0xFF
+            self._speak(bytes(frame))
+
+    def _speak(self, frame: bytes) -> None:
+        self._write(frame)
+        self._voice.seq = (self._voice.seq + 1) & 0xFF
 
     def _spread(self, stamp_us: int, copy: int) -> int:
         return stamp_us - (self._copies - 1 - copy) * 10_000 // self._copies
@@ -139,7 +138,7 @@ class Vehicle(Thread):
     def _ear_decode(self, frame: bytes) -> common.MAVLink_message | None:
         message = self._ear.decode(bytearray(frame))
         self._voice.srcSystem, self._voice.srcComponent = message.get_srcSystem(), message.get_srcComponent()
-        return message if message.get_type() in ("HEARTBEAT", "SYSTEM_TIME", "GPS_RAW_INT", "HIGHRES_IMU") else None
+        return message if message.get_type() in ("HEARTBEAT", "SYSTEM_TIME", "GPS_RAW_INT") else None
 
     def _listen(self) -> None:
         """Count what fusiond asks for."""
