@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from operator import attrgetter
 from threading import Event, current_thread
 from typing import Any
 
@@ -31,6 +32,7 @@ from fusiond_adapters.can_bus import CanBus
 from fusiond_adapters.host_clock import HostClock
 from fusiond_adapters.inputs import Inbox, InputLost, LiveInput
 from fusiond_adapters.logs.record import Recorder
+from fusiond_adapters.mavlink import message_id
 from fusiond_adapters.mavlink_link import MavlinkLink
 from fusiond_adapters.outputs import Around, LiveOutput, OutputLost
 from fusiond_adapters.outputs_table import make_outputs
@@ -40,6 +42,7 @@ from fusiond_adapters.systemd import Notifier, watchdog_s
 FIRST_PAUSE_S = 0.1  # before what was lost is opened again; doubled each time, up to live.reopen_max_s
 STEADY_S = 10.0  # what lasted so long begins anew with the first pause
 SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
+CAN_ID = attrgetter("arbitration_id")
 REPORT_S = 10.0  # between two lines about losses, while there are any
 
 LEVEL = {"info": logging.INFO, "notice": logging.INFO, "warning": logging.WARNING, "critical": logging.CRITICAL}
@@ -145,9 +148,10 @@ class Daemon:
     def _make_inputs(self, config: Config) -> dict[str, LiveInput[Any]]:
         size = config.live.queue_frames
         links = [
-            MavlinkLink(config, link, Inbox(size, self._wake.set), self.clock, self._is_alive) for link in config.mavlink
+            MavlinkLink(config, link, Inbox(size, self._wake.set, message_id), self.clock, self._is_alive)
+            for link in config.mavlink
         ]
-        buses = [CanBus(config, bus, Inbox(size, self._wake.set), self.clock) for bus in config.can]
+        buses = [CanBus(config, bus, Inbox(size, self._wake.set, CAN_ID), self.clock) for bus in config.can]
         return {f"{kind}.{source.name}": source for kind, made in (("mavlink", links), ("can", buses)) for source in made}
 
     def _is_alive(self) -> bool:

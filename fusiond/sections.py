@@ -224,7 +224,7 @@ class Zenoh(Section, frozen=True, kw_only=True):
 class Live(Section, frozen=True, kw_only=True):
     """[live]: how `fusiond run` treats its inputs."""
 
-    queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 4096  # of each input; when full the oldest is dropped
+    queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 1024  # of each input; when full it is thinned
     reopen_max_s: Annotated[float, Meta(gt=0, le=600)] = 5.0  # longest pause before a lost input is opened again
 
 

@@ -7,9 +7,11 @@ Writes FOLDER/out/checks.json; the exit status is 1 where a check failed.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import shutil
 import statistics
 import subprocess
 import sys
@@ -198,6 +200,14 @@ def tried(fault: Callable[[Bench], str], bench: Bench) -> str:
         return f"{fault(bench)} (at the second try; before, while the machine stood still for {stood_s:.1f} s: {failed})"
 
 
+def keep_box(folder: Path) -> None:
+    """The black box and its configuration, to replay what went wrong."""
+    with contextlib.suppress(OSError):  # a box that is away, or turns over, must not end the checks
+        for file in (ETC / "fusiond.toml", ETC / "wheels.dbc", *sorted(BOX.iterdir())):
+            folder.mkdir(exist_ok=True)
+            shutil.copy2(file, folder)
+
+
 def run_through(checks: Checks, folder: Path) -> None:
     """The service on its drive, and then every fault."""
     prepare(folder)
@@ -220,7 +230,8 @@ def run_through(checks: Checks, folder: Path) -> None:
 
         if checks.run("states over Zenoh", begin):
             for name, fault in FAULTS:
-                checks.run(name, lambda fault=fault: tried(fault, bench))  # type: ignore[misc]
+                if not checks.run(name, lambda fault=fault: tried(fault, bench)):  # type: ignore[misc]
+                    keep_box(folder.parent / "out" / re.sub(r"\W+", "-", name))
             vehicle.end()
     checks.run("journal", lambda: journal_fields(UNIT))
 

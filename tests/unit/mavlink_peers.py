@@ -193,7 +193,7 @@ class Ear:
 def link_to(peer: Peer, folder: Path, more: str = "") -> tuple[Config, MavlinkLink]:
     """A link to a peer."""
     settings = configuration(folder, peer.connection, more)
-    return settings, MavlinkLink(settings, "fc", Inbox(4096, lambda: None), CLOCK, lambda: True)
+    return settings, MavlinkLink(settings, "fc", Inbox(4096, lambda: None, hash), CLOCK, lambda: True)
 
 
 class Recorder:

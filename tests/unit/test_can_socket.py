@@ -75,7 +75,7 @@ def test_the_kernel_tells_of_an_overflow() -> None:
 
 def test_error_frames_are_counted_and_a_change_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "fusiond")
-    bus = CanBus(configuration(tmp_path, "udpin:127.0.0.1:14550"), "car", Inbox(16, lambda: None), HostClock())
+    bus = CanBus(configuration(tmp_path, "udpin:127.0.0.1:14550"), "car", Inbox(16, lambda: None, hash), HostClock())
 
     def error(classes: int, detail: int = 0) -> str:
         assert bus.decode(CanFrame(classes, False, bytes([0, detail, *bytes(6)]), is_error=True), 0) == []

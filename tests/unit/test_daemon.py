@@ -312,18 +312,6 @@ def test_zenoh_away_at_first(tmp_path: Path, channel: str, bus: can.BusABC) -> N
             assert run.daemon.outputs["zenoh"].counts()["stale"] > 10
 
 
-def test_full_inbox_drops_the_oldest_and_counts(tmp_path: Path) -> None:
-    from fusiond_adapters.inputs import Inbox  # noqa: PLC0415
-
-    woken: list[int] = []
-    inbox: Inbox[int] = Inbox(16, lambda: woken.append(1))
-    for number in range(20):
-        inbox.put(number, number)
-    assert (inbox.received, inbox.dropped, len(woken)) == (20, 4, 1)
-    assert [item for _, item in inbox.take()] == list(range(4, 20))
-    assert inbox.take() == []
-
-
 def test_reload(tmp_path: Path) -> None:
     """A link's connection changes live; with a change of the filter beside it, nothing does."""
     first, second = free_port(), free_port()

@@ -57,7 +57,7 @@ class Live:
 
 class Source:
     def __init__(self, wake: Callable[[], None]) -> None:
-        self.inbox: Inbox[int] = Inbox(1000, wake)
+        self.inbox: Inbox[int] = Inbox(1000, wake, hash)
 
 
 class Rig:

@@ -78,7 +78,7 @@ def station_at(
     connection: str, folder: Path, more: str = "", parameters: tuple[Parameter, ...] = ()
 ) -> tuple[GroundStation, Now]:
     settings, now = settings_for(connection, folder, more), Now()
-    link = MavlinkLink(settings, "fc", Inbox(16, lambda: None), CLOCK, lambda: True)
+    link = MavlinkLink(settings, "fc", Inbox(16, lambda: None, hash), CLOCK, lambda: True)
     return GroundStation(settings, {"mavlink.fc": link}, now, parameters), now
 
 

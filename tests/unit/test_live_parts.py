@@ -184,7 +184,7 @@ def test_black_box_goes_on_when_there_is_room_again(tmp_path: Path) -> None:
 
 
 def test_can_frames_as_candump_writes_them(settings: Config) -> None:
-    bus = CanBus(settings, "car", Inbox(16, lambda: None), HostClock())
+    bus = CanBus(settings, "car", Inbox(16, lambda: None, hash), HostClock())
     t_ns = 1_700_000_000_123_456_000
     lines = [
         (CanFrame(0x100, False, b"\x01\xab"), "100#01AB"),
