@@ -159,10 +159,10 @@ class Vehicle(Thread):
             return  # nobody listens just now
 
     def _send_can(self, number: int, is_extended: bool, data: bytes, now: int) -> None:
+        if number == self._counted_id:  # once: copies of a wheel's frame are as stale as they look
+            self._count += 1
+            data = data[:-1] + bytes([data[-1] & ~COUNTER | self._count & COUNTER])
         for _ in range(self._copies):
-            if number == self._counted_id:
-                self._count += 1
-                data = data[:-1] + bytes([data[-1] & ~COUNTER | self._count & COUNTER])
             self._write_can(number | EXTENDED * is_extended, data, now)
 
     def _write_can(self, number: int, data: bytes, now: int) -> None:
