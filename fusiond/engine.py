@@ -1,8 +1,10 @@
 """The engine: events in, and a state message at every tick of receive time. Live and replay are this same code.
 
 Tick k stands k periods after the receipt of the first event. It is made after all events received up to it and before
-any received later, so what it tells depends on the events and their receive stamps alone. Whoever drives the engine
-gives events in order of receipt; live, `elapse` besides lets time pass where no event comes.
+any received later, so what it tells depends on the events and their receive stamps alone. With `publish.on_imu` it waits
+for the first inertial sample from then on, for half a period at the most, and stands at its receipt: its state is as new
+as that sample. Whoever drives the engine gives events in order of receipt; live, `elapse` besides lets time pass where no
+event comes.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from fractions import Fraction
 
 from fusiond.fusion import Fusion, Receipt
 from fusiond.kernel import Outcome
-from fusiond.measurements import Received
+from fusiond.measurements import ImuSample, Received
 from fusiond.messages import OutcomeCounts, StateMessage, state_message
 from fusiond.sections import Config
 from fusiond.stored import StoredState
@@ -48,6 +50,8 @@ class Engine:
         self._vehicle = config.vehicle.name
         self._on_tick, self._before_tick = on_tick, before_tick
         self._period = SECOND / Fraction(rate_hz).limit_denominator(RATE_DENOMINATOR)
+        self._wait_ns = int(self._period / 2) if config.publish.on_imu else 0  # of a tick for an inertial sample
+        self._imu = self.fusion.plan.sources[self.fusion.plan.imu_source]
         self._tick = 0  # number of the next tick
         self._prepared: StateMessage | None = None  # its message, if nothing comes before it
         self.take: Callable[[Received], Receipt | None] = self.fusion.receive
@@ -60,8 +64,8 @@ class Engine:
 
     @property
     def next_tick_ns(self) -> int | None:
-        """When the next tick is due; None before the first event."""
-        return None if self.first_ns is None else self.first_ns + self._since(self._tick)
+        """When the next tick is made, if no inertial sample has it made sooner; None before the first event."""
+        return None if self.first_ns is None else self.first_ns + self._since(self._tick) + self._wait_ns
 
     def advance(self, t_receive_ns: int) -> None:
         """Let time pass up to an event; one received earlier than the one before it counts as received with that."""
@@ -72,6 +76,13 @@ class Engine:
                 self._publish_before(t_receive_ns)
             self.now_ns = t_receive_ns
         self._prepared = None
+
+    def taken(self, event: Received) -> None:
+        """An event has been taken, after `advance` to its receipt: make the tick that waited for it."""
+        if not self._wait_ns or self._on_tick is None or event.source != self._imu:
+            return
+        if isinstance(event.payload, ImuSample) and self._since(self._tick) <= self.elapsed_ns:
+            self._make_tick(self.elapsed_ns)
 
     def elapse(self, t_ns: int) -> None:
         """Make the ticks up to an instant before which no event can come any more."""
@@ -102,17 +113,23 @@ class Engine:
         if self._on_tick is None:
             return
         until = min(t_ns, self.now_ns + LONGEST_SILENCE_NS) - self.first_ns
-        while (since := self._since(self._tick)) < until:
-            if self._before_tick:
-                self._before_tick(since)
-            message, self._prepared = self._prepared or self.message(self.first_ns + since), None
-            self._on_tick(since, message)
-            self.rows += 1
-            self._tick += 1
-        if self._since(self._tick) < t_ns - self.first_ns:
-            following = -((self.first_ns - t_ns) * self._period.denominator // self._period.numerator)
+        while (since := self._since(self._tick) + self._wait_ns) < until:
+            self._make_tick(since)
+        if self._since(self._tick) + self._wait_ns < t_ns - self.first_ns:
+            before = self.first_ns + self._wait_ns - t_ns
+            following = -(before * self._period.denominator // self._period.numerator)
             self.skipped += following - self._tick
             self._tick, self._prepared = following, None
+
+    def _make_tick(self, since_ns: int) -> None:
+        """The next tick, at an instant [from the first event]."""
+        assert self.first_ns is not None and self._on_tick is not None
+        if self._before_tick:
+            self._before_tick(since_ns)
+        message, self._prepared = self._prepared or self.message(self.first_ns + since_ns), None
+        self._on_tick(since_ns, message)
+        self.rows += 1
+        self._tick += 1
 
 
 def totals(fusion: Fusion) -> OutcomeCounts:

@@ -87,6 +87,9 @@ class LiveEngine:
                 self._frames = frames[number:]
                 return True
             self._take(self._ordered(t_ns), source, item)
+            if give_way and self.unfinished:  # a tick that has waited for this frame
+                self._frames = frames[number + 1 :]
+                return True
         self._frames = []
         now, due = self._now(), self.engine.next_tick_ns
         if due is not None and due <= now:
@@ -133,6 +136,7 @@ class LiveEngine:
             if receipt is not None:
                 self.offered += 1
                 self.publication.add(event, receipt)
+                self.engine.taken(event)
                 taken += receipt.refusal is not Outcome.INVALID
         if taken:
             self.engine.fusion.history.catch_up()  # now, so that a tick finds it done

@@ -126,6 +126,7 @@ class Replay:
             return
         if self._publication:
             self._publication.add(event, receipt)
+        self.engine.taken(event)
         if receipt.refusal is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)

@@ -206,6 +206,7 @@ class Publish(Section, frozen=True, kw_only=True):
     """[publish]"""
 
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
+    on_imu: bool = False  # each waits up to half a period for the next IMU sample, and is of its receipt
     settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # of the state at the horizon, at most; 0: none
     innovations: bool = True  # tell of every measurement how it was judged
     encoding: Encoding = "json"  # "json" or "msgpack"

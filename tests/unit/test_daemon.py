@@ -16,6 +16,7 @@ from threading import Event
 import can
 import pytest
 from live import DEADLINE, SYSTEM, Autopilot, Running, configuration, parsed, running
+from msgspec.structs import replace
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
@@ -347,13 +348,14 @@ def replayed(settings: Config, logs: list[str]) -> list[bytes]:
     return told
 
 
-@pytest.mark.parametrize("file_mb", [64.0, 0.01])
+@pytest.mark.parametrize(("file_mb", "on_imu"), [(64.0, False), (0.01, False), (64.0, True)])
 def test_replay_of_the_black_box_publishes_the_same_bytes(
-    tmp_path: Path, channel: str, bus: can.BusABC, file_mb: float
+    tmp_path: Path, channel: str, bus: can.BusABC, file_mb: float, on_imu: bool
 ) -> None:
     port = free_port()
     more = f'[record]\nfolder = "box"\nfile_mb = {file_mb}\n'
     settings = configuration(tmp_path, f"udpin:127.0.0.1:{port}", more, channel)
+    settings = replace(settings, publish=replace(settings.publish, on_imu=on_imu))
     with running(settings) as run, closing(udp(port)[0]) as peer:
         drive(run, lambda data: peer.sendto(data, ("127.0.0.1", port)), bus,
               lambda: aligned(run) and fused(run, "left") > 90, Autopilot())  # fmt: skip

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common
 
 from fusiond.daemon import Daemon
@@ -21,9 +22,11 @@ SAMPLES = 200
 class Rig:
     """The engine of a daemon that does not run, on a clock that the test sets."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, on_imu: bool = False) -> None:
         self.clock = PlayedClock(BEGIN_NS, 1.0)
-        daemon = Daemon(configuration(folder, "udpin:127.0.0.1:0"), zenoh=False, clock=self.clock)
+        settings = configuration(folder, "udpin:127.0.0.1:0")
+        settings = replace(settings, publish=replace(settings.publish, on_imu=on_imu))
+        daemon = Daemon(settings, zenoh=False, clock=self.clock)
         self.said: list[Message] = []
         self.inputs = daemon.inputs
         self.live = LiveEngine(daemon.config, self.clock.now_ns, self.said.append)
@@ -92,10 +95,40 @@ def test_what_is_prepared_is_what_the_tick_tells(tmp_path: Path) -> None:
     assert times == SAMPLES + SAMPLES // 10  # once after each sample, and at the ticks that come with one
 
 
-def test_giving_way_changes_no_message(tmp_path: Path) -> None:
+def test_a_tick_that_waited_for_a_sample_gives_way_too(tmp_path: Path) -> None:
+    """The tick of 10 ms comes with the sample at 12 ms; the two received meanwhile wait until its state is out."""
+    rig = Rig(tmp_path, on_imu=True)
+    for number in range(4):
+        rig.receive(number)
+        rig.live.step(rig.inputs, give_way=True)
+    rig.live.finish_tick()
+    before, taken = len(rig.said), rig.taken()
+    for number in (4, 5, 6):
+        rig.receive(number)
+    assert rig.live.step(rig.inputs, give_way=True)
+    (state,) = rig.said[before:]
+    assert isinstance(state, StateMessage)
+    assert state.t_ns == BEGIN_NS + 12 * MS
+    assert rig.taken() == taken + 1
+    assert not rig.live.step(rig.inputs, give_way=True)
+    assert rig.taken() == taken + 3
+
+
+def test_a_tick_that_waits_in_vain_is_made_after_half_a_period(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, on_imu=True)
+    rig.receive(0)
+    rig.live.step(rig.inputs)
+    for since_ms, states in ((10, 1), (14, 1), (15, 2), (24, 2), (25, 3)):
+        rig.clock.set(BEGIN_NS + since_ms * MS)
+        rig.live.step(rig.inputs)
+        assert sum(isinstance(message, StateMessage) for message in rig.said) == states
+
+
+@pytest.mark.parametrize("on_imu", [False, True])
+def test_giving_way_changes_no_message(tmp_path: Path, on_imu: bool) -> None:
     found = []
     for give_way in (False, True):
-        rig = Rig(tmp_path)
+        rig = Rig(tmp_path, on_imu=on_imu)
         for number in range(SAMPLES):
             rig.receive(number)
             while rig.live.step(rig.inputs, give_way=give_way):

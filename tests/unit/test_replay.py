@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from fusiond import config
 from fusiond.comparison import Errors, Truth, TruthRow, Window
+from fusiond.engine import Engine
 from fusiond.errors import UsageError
 from fusiond.fusion import Fusion, Receipt
-from fusiond.measurements import ImuSample, Invalid, Received, WheelSpeed
+from fusiond.measurements import GnssPosition, ImuSample, Invalid, Received, WheelSpeed
 from fusiond.messages import OutcomeCounts, StateMessage, csv_row, state_message
 from fusiond.progress import line, shown
 from fusiond.replay import Pacer, Replay, Wants, Withheld, parse_interval, parse_withheld
@@ -100,6 +103,44 @@ def test_a_tick_comes_after_all_it_may_know_and_before_the_rest(setup: Config, e
 def test_an_event_received_at_the_very_tick_is_in_it(setup: Config) -> None:
     _, instants = ticks_of(setup, [imu(T0), imu(T0 + 100 * MS, 1)], rate_hz=10.0)
     assert instants == [0, 100 * MS]
+
+
+def test_a_tick_waits_for_an_inertial_sample_for_half_a_period(setup: Config) -> None:
+    """With `on_imu`, at 10 Hz. The tick at 0 takes the sample there; that at 100 ms the one at 130, not the fix before it;
+    that at 200 ms none, for the one at 260 comes too late; that at 300 ms the one at 300, that at 400 ms the one at 449."""
+    waiting = replace(setup, publish=replace(setup.publish, on_imu=True))
+    fix = Received("gps0.position", 0, "", None, T0 + 110 * MS, GnssPosition(0.8, 0.2, 500.0))
+    samples = [imu(T0 + t * MS, k) for k, t in enumerate((0, 90, 130, 140, 260, 300, 449, 460))]
+    events = sorted([*samples, fix], key=lambda event: event.t_receive_ns)
+    _, instants = ticks_of(waiting, events, rate_hz=10.0)
+    assert [t / MS for t in instants] == [0, 130, 250, 300, 449]
+
+
+def test_another_sensor_does_not_end_the_wait(setup: Config) -> None:
+    waiting = replace(setup, publish=replace(setup.publish, on_imu=True))
+    other = Received("imu1", 0, "", None, T0 + 110 * MS, ImuSample((0.0, 0.0, -9.8), (0.0, 0.0, 0.0)))
+    order: list[tuple[int, int]] = []
+    engine = Engine(waiting, 10.0, lambda since, _: order.append((since, engine.now_ns - T0)))
+    for event in (imu(T0), other, imu(T0 + 120 * MS, 1)):
+        engine.advance(event.t_receive_ns)
+        if event is not other:  # which this configuration does not know
+            engine.take(event)
+        engine.taken(event)
+    assert order == [(0, 0), (120 * MS, 120 * MS)]
+
+
+def test_a_tick_that_waited_tells_of_the_sample_that_it_waited_for(setup: Config, events: list[Received]) -> None:
+    """Which is no older than the simulated transport takes; without waiting it is up to 10 ms older."""
+    waiting, ages = replace(setup, publish=replace(setup.publish, on_imu=True)), {}
+    for settings in (setup, waiting):
+        found: list[float] = []
+
+        def tick(message: StateMessage, _: Errors | None, found: list[float] = found) -> None:
+            found.append(message.age_ms or 0.0)
+
+        Replay(settings, Wants(RATE, on_tick=[tick])).run(events)
+        ages[settings.publish.on_imu] = found[:-4]  # at the end there are only late fixes
+    assert max(ages[True]) < 2.5 < statistics.median(ages[False])
 
 
 def test_ticks_tell_what_a_live_fusion_would(setup: Config, events: list[Received]) -> None:
