@@ -1,6 +1,6 @@
 """How long a publication takes to reach a subscriber in another process, and what the daemon's CPU time goes into.
 
-    python -m benchmarks.latency [--seconds 30] [--runs 5] [--as-installed] [--out out/latency]
+    python -m benchmarks.latency [--seconds 30] [--runs 5] [--as-installed] [--by-clock] [--out out/latency]
 
 Load: IMU at 400 Hz, GNSS at 10 Hz and 200 ms late, both as MAVLink over UDP from a process of their own; four wheels at
 100 Hz in one CAN frame on python-can's virtual bus; 100 publications a second over Zenoh, with the black box running.
@@ -9,9 +9,10 @@ of reader, the autopilot's process sending as before. It, too, is measured from 
 What a host takes from its guests' processors (steal) is in all figures, and they follow it. It is told for each run, and
 a second row has what arrived while the host took nothing: from 250 ms before the instant of the publication to 250 ms
 after its arrival the count of steal, which moves each time another 10 ms have come together, stood still.
-With --as-installed the daemon has the priority and the timers that systemd/fusiond.service gives it; the other processes
-never have.
-What the phase of the inertial samples against the publications is, chance decides anew in each run, and it matters.
+A publication waits for the next inertial sample (`publish.on_imu`), but not with --by-clock, as is the default of the
+configuration: then the sample is up to 2.5 ms old at the instant of the publication, by a phase that chance decides anew
+in each run. With --as-installed the daemon has the priority and the timers that systemd/fusiond.service gives it; the
+other processes never have.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def free_port(kind: socket.SocketKind) -> int:
         return int(probe.getsockname()[1])
 
 
-def configuration(folder: Path, udp: int, tcp: int) -> Config:
+def configuration(folder: Path, udp: int, tcp: int, *, on_imu: bool = False) -> Config:
     (folder / "wheels.dbc").write_text(DBC)
     wheels = "".join(f'[wheel.{name}]\nbus = "car"\nmessage = "WHEELS"\nsignal = "{name}"\n' for name in WHEELS)
     text = f"""
@@ -79,6 +80,7 @@ name = "bench"
 heading_deg = 30.0
 [publish]
 rate_hz = {PUBLISH_HZ}
+on_imu = {str(on_imu).lower()}
 [zenoh]
 listen = ["tcp/127.0.0.1:{tcp}"]
 [record]
@@ -336,10 +338,10 @@ def reference(udp: int, seconds: float) -> Reading:
             return msgspec.json.decode(reader.communicate()[0], type=Reading)
 
 
-async def measure(folder: Path, seconds: float) -> tuple[Reading, str]:
+async def measure(folder: Path, seconds: float, *, on_imu: bool) -> tuple[Reading, str]:
     """What reached the subscriber, and what the daemon says of itself."""
     udp, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
-    daemon, meter = Daemon(configuration(folder, udp, tcp)), Meter()
+    daemon, meter = Daemon(configuration(folder, udp, tcp, on_imu=on_imu)), Meter()
     run = asyncio.create_task(serve(daemon))
     await daemon.up.wait()
     watch_stages(daemon, meter)
@@ -397,6 +399,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/latency"))
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--as-installed", action="store_true", help=f"nice {NICE}, as the unit has it; it takes a privilege")
+    parser.add_argument("--by-clock", action="store_true", help="a publication does not wait for an inertial sample")
     parser.add_argument("--feed", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--subscribe", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--publish-only", type=int, help=argparse.SUPPRESS)
@@ -417,11 +420,12 @@ def main(arguments: list[str]) -> None:
         nice = os.nice(NICE if options.as_installed else 0)
         if options.as_installed:
             set_timer_slack(TIMER_SLACK_NS)
+        way = "by the clock" if options.by_clock else "on inertial samples"
         python, cpus = platform.python_version(), os.cpu_count()
-        print(f"fusiond {__version__}, Python {python}, {cpus} CPUs, nice {nice}, {options.seconds:g} s", flush=True)
+        print(f"fusiond {__version__}, Python {python}, {cpus} CPUs, nice {nice}, {options.seconds:g} s, {way}", flush=True)
         states, references = [], []
         for number in range(options.runs):
-            reading, report = asyncio.run(measure(options.out, options.seconds))
+            reading, report = asyncio.run(measure(options.out, options.seconds, on_imu=not options.by_clock))
             states.append(reading)
             references.append(reference(free_port(socket.SOCK_DGRAM), options.seconds))
             print(f"run {number + 1}: {len(reading.arrivals)} states, {reading.dropped} dropped on the way to Zenoh")
