@@ -26,7 +26,7 @@ from fusiond.sections import Zenoh as ZenohSection
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
 KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
-RETRY = {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2}  # of connecting: Zenoh's own is 1 to 4 s
+RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting: Zenoh's own is 1 to 4 s
 QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
 PATIENCE_US = 1000  # with which a sample waits for room there, as Zenoh has it
 TELL_LAST_S = 1.0  # a reader hears within this that it missed the last one

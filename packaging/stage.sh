@@ -9,6 +9,7 @@ home=$root/opt/fusiond
 
 "${PYTHON:-python3}" -m venv --clear "$home"
 "$home/bin/python" -m pip install --quiet --disable-pip-version-check --root-user-action=ignore "${WHEEL:-.}"
+"$home/bin/python" -m pip uninstall --quiet --yes --root-user-action=ignore setuptools  # it has a hand in every start
 if [ -n "$root" ]; then  # paths as they will be
     grep -rlIF "$home" "$home/bin" "$home/pyvenv.cfg" | xargs sed -i "s|$home|/opt/fusiond|g"
 fi
