@@ -55,10 +55,9 @@ def chi_square(probability: float, freedom: int) -> float:
     low, high = 0.0, 1.0
     while distribution(high) < probability and high < 1000:
         high *= 2
-    for _ in range(200):
-        middle = (low + high) / 2
+    while low < (middle := (low + high) / 2) < high:
         low, high = (middle, high) if distribution(middle) < probability else (low, middle)
-    return (low + high) / 2
+    return middle
 
 
 def correlation_factor(interval: float, correlation: float) -> float:
