@@ -105,11 +105,12 @@ class Dialect:
     """The messages of one pymavlink dialect. Raises ConfigError where there is no such dialect."""
 
     def __init__(self, name: str) -> None:
-        known = sorted(module.name for module in pkgutil.iter_modules(dialects.__path__))
-        if name not in known:
-            raise ConfigError(f"there is no MAVLink dialect '{name}'; known: {', '.join(known)}")
+        try:
+            self._types: dict[int, Any] = importlib.import_module(f"{dialects.__name__}.{name}").mavlink_map
+        except (ImportError, AttributeError):
+            known = ", ".join(sorted(module.name for module in pkgutil.iter_modules(dialects.__path__)))
+            raise ConfigError(f"there is no MAVLink dialect '{name}'; known: {known}") from None
         self.name = name
-        self._types: dict[int, Any] = importlib.import_module(f"pymavlink.dialects.v20.{name}").mavlink_map
         self._seeds = {number: _seed(kind) for number, kind in self._types.items()}
         self.ids: dict[str, int] = {kind.msgname: number for number, kind in self._types.items()}
 
