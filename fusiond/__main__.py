@@ -7,7 +7,7 @@ import gc
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -46,8 +46,9 @@ examples:
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line's grammar."""
+def parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The command line's grammar; where a command is given, of the others their names alone: to fill them in takes longer
+    than the daemon can spare."""
     top = argparse.ArgumentParser(
         prog="fusiond",
         description="Fuse a vehicle's IMU, GNSS (MAVLink) and wheel speeds (CAN) into one state that knows its errors.",
@@ -56,12 +57,22 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"fusiond {__version__}")
     top.set_defaults(run=run_command)
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    run = _add(commands, "run", "fuse the live inputs, and publish the state")
+    for name, (about, fill) in GRAMMAR.items():
+        one = commands.add_parser(
+            name, help=about, description=f"{about.capitalize()}.", formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        if command in (None, name):
+            fill(one)
+    return top
+
+
+def _fill_run(run: argparse.ArgumentParser) -> None:
     run.description, run.epilog = RUN, f"example:\n  fusiond run --config car.toml\n\n{EXIT_CODES}"
     run.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
     run.set_defaults(run=run_daemon)
-    _add_replay(commands)
-    watch = _add(commands, "top", "show a running vehicle's state, sources, latencies and health in the terminal")
+
+
+def _fill_top(watch: argparse.ArgumentParser) -> None:
     watch.description, watch.epilog = TOP, f"example:\n  fusiond top --connect tcp/192.168.1.5:7447\n\n{EXIT_CODES}"
     watch.add_argument("--vehicle", metavar="NAME", help="which one; default: the only one that is there")
     watch.add_argument(
@@ -69,33 +80,33 @@ def parser() -> argparse.ArgumentParser:
     )
     watch.add_argument("--zenoh", metavar="FILE", help="Zenoh's own configuration file, for TLS and the like")
     watch.add_argument("--once", action="store_true", help="print one screen as text, and end")
-    check = _add(commands, "check", "say what a configuration is going to do, or what is wrong with it")
+
+
+def _fill_check(check: argparse.ArgumentParser) -> None:
     check.epilog = "example:\n  fusiond check --config car.toml"
     check.add_argument("--config", metavar="C.toml", required=True, help="configuration file")
-    mount = _add(commands, "mount", "find how the IMU is turned in the vehicle, from logs")
+
+
+def _fill_mount(mount: argparse.ArgumentParser) -> None:
     mount.description, mount.epilog = MOUNT, "example:\n  fusiond mount --config car.toml drive.tlog drive.log"
     mount.add_argument("logs", metavar="LOG", nargs="+", help="as for replay")
     mount.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
-    simulate = _add(commands, "simulate", "write the logs of a simulated drive, and the truth about it")
+
+
+def _fill_simulate(simulate: argparse.ArgumentParser) -> None:
     simulate.epilog = "example:\n  fusiond simulate --config configs/simulate-demo.toml --out drive"
     simulate.add_argument("--config", metavar="S.toml", required=True, help="scenario file")
     simulate.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder to write to; made if need be")
     simulate.add_argument("--seed", metavar="N", type=_seed, help="in place of the scenario's seed")
-    show = _add(commands, "demo", "play a bundled drive to a running fusiond, and explain what comes out")
+
+
+def _fill_demo(show: argparse.ArgumentParser) -> None:
     show.epilog = "example:\n  fusiond demo --out out/demo"
     show.add_argument("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="default: out/demo")
     show.add_argument("--speed", metavar="X", type=_positive, default=15.0, help="X times real time; default: 15")
-    return top
 
 
-def _add(commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, about: str) -> argparse.ArgumentParser:
-    return commands.add_parser(
-        name, help=about, description=f"{about.capitalize()}.", formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-
-
-def _add_replay(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    command = _add(commands, "replay", "fuse recorded logs into a track")
+def _fill_replay(command: argparse.ArgumentParser) -> None:
     command.description, command.epilog = REPLAY, f"{REPLAY_EXAMPLES}\n{EXIT_CODES}"
     add = command.add_argument
     add("logs", metavar="LOG", nargs="+", help=".tlog, .log (candump -L), .asc, .blf, .trc, ..., also .gz; or NAME=LOG")
@@ -146,6 +157,17 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+GRAMMAR: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
+    "run": ("fuse the live inputs, and publish the state", _fill_run),
+    "replay": ("fuse recorded logs into a track", _fill_replay),
+    "top": ("show a running vehicle's state, sources, latencies and health in the terminal", _fill_top),
+    "check": ("say what a configuration is going to do, or what is wrong with it", _fill_check),
+    "mount": ("find how the IMU is turned in the vehicle, from logs", _fill_mount),
+    "simulate": ("write the logs of a simulated drive, and the truth about it", _fill_simulate),
+    "demo": ("play a bundled drive to a running fusiond, and explain what comes out", _fill_demo),
+}
+
+
 def run_daemon(arguments: argparse.Namespace) -> None:
     """fusiond run"""
     gc.disable()  # what is imported never becomes garbage: to look for it would take a tenth of the start
@@ -185,7 +207,8 @@ def run_command(arguments: argparse.Namespace) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. A wrong command line ends with SystemExit(2), as argparse does."""
-    arguments = parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    arguments = parser(words[0] if words else None).parse_args(words)
     try:
         arguments.run(arguments)
         sys.stdout.flush()
