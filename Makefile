@@ -11,7 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 TYPING := build/typing/fusiond_adapters
-DEMO := fusiond/data/demo
+DEMO := fusiond/app/demo/data
 
 .PHONY: demo test test-system lint study bench soak demo-data deb install uninstall clean
 
@@ -58,7 +58,7 @@ uninstall:
 	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf
 	packaging/postrm remove
 
-$(READY): pyproject.toml setup.py $(wildcard fusiond/*.px[id] fusiond/*.pyx fusiond/compiled/*.px[id])
+$(READY): pyproject.toml setup.py $(wildcard fusiond/filter/kernel/*.px[ix])
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'

@@ -5,19 +5,21 @@ from pathlib import Path
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
+KERNEL = Path("fusiond/filter/kernel")
+
 # No fused multiply-add: the results are to be the same bits on every processor.
-KERNELS = [
+WIDTHS = [
     Extension(
-        f"fusiond.{name}",
-        [f"fusiond/{name}.pyx"],
-        depends=["fusiond/_kernel.pxi", *map(str, sorted(Path("fusiond/compiled").glob("*.pxi")))],
+        f"fusiond.filter.kernel.{name}",
+        [str(KERNEL / f"{name}.pyx")],
+        depends=[str(part) for part in sorted(KERNEL.glob("*.pxi"))],
         extra_compile_args=["-O3", "-ffp-contract=off"],
     )
-    for name in ("_kernel", "_kernel_wide")
+    for name in ("narrow", "wide")
 ]
 
-modules = cythonize(KERNELS)
+modules = cythonize(WIDTHS)
 for module in modules:
-    module.optional = True  # a failed build leaves the NumPy twin (cythonize drops the flag of the original)
+    module.optional = True  # a failed build leaves the kernel to the interpreter (cythonize drops the original's flag)
 
 setup(ext_modules=modules)

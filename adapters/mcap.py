@@ -20,12 +20,12 @@ from types import TracebackType
 import msgspec
 
 from fusiond import __version__
-from fusiond.publication import config_table
-from fusiond.sections import Config
-from fusiond.toml_file import ConfigError
-from fusiond_adapters.foxglove import SHOWN, Channel, Converter, Record, channels
-from fusiond_adapters.logs.record import FLUSH_S, MEGABYTE, file_name, make_room
-from fusiond_adapters.outputs import POLL_S, Outbox, OutputLost
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond.messages.schedule import config_table
+from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond_adapters.foxglove.converter import SHOWN, Channel, Converter, Record, channels
+from fusiond_adapters.logs.black_box import FLUSH_S, MEGABYTE, file_name, make_room
 
 try:
     from mcap import records

@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-from fusiond.estimate import Mode
-from fusiond.messages import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
-from fusiond.sections import Config
-from fusiond.toml_file import ConfigError
-from fusiond_adapters.outputs import POLL_S, Outbox, OutputLost
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond.estimator.solution import Mode
+from fusiond.messages.types import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
+from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
 
 try:
     from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server

@@ -23,9 +23,9 @@ import msgspec
 import zenoh
 
 from benchmarks.latency import configuration, free_port, process, turn_wheels
-from fusiond.daemon import Daemon, serve
-from fusiond.latency import RecentLatencies
-from fusiond.sections import Config, Mcap
+from fusiond.app.live.daemon import Daemon, serve
+from fusiond.config.schema import Config, Mcap
+from fusiond.messages.latency import RecentLatencies
 
 QUIET, READ, STOPPED, FULL_DISKS = "quiet", "a subscriber", "the subscriber stopped", "disks full"
 DEAD, BACK, AGAIN = "the router dead", "the router back", "quiet again"

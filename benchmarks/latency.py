@@ -40,12 +40,13 @@ import msgspec
 import zenoh
 from pymavlink.dialects.v20 import common
 
-from fusiond import __version__, config
-from fusiond.client import Client
-from fusiond.daemon import Daemon, serve
-from fusiond.messages import StateMessage
-from fusiond.sections import Config, Zenoh
-from fusiond_adapters.zenoh import open_session
+from fusiond import __version__
+from fusiond.app.client import Client
+from fusiond.app.live.daemon import Daemon, serve
+from fusiond.config import load as config
+from fusiond.config.schema import Config, Zenoh
+from fusiond.messages.types import StateMessage
+from fusiond_adapters.zenoh.session import open_session
 
 IMU_HZ, GNSS_HZ, CAN_HZ, PUBLISH_HZ = 400, 10, 100, 100
 GNSS_LATE_US = 200_000

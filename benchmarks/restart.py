@@ -23,8 +23,8 @@ from pathlib import Path
 from threading import Event
 
 from benchmarks.latency import configuration, free_port, process
-from fusiond.client import Client
-from fusiond.messages import StateMessage
+from fusiond.app.client import Client
+from fusiond.messages.types import StateMessage
 
 UNIT = Path(__file__).parents[1] / "systemd" / "fusiond.service"
 LIBRARIES = "import asyncio, can, cantools, numpy, pymavlink.dialects.v20.common, zenoh"

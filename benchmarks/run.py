@@ -23,13 +23,13 @@ import msgspec
 import numpy as np
 
 from fusiond import __version__
-from fusiond.fusion import Fusion
-from fusiond.kernel import ROW, Kernel, make_kernel
-from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
-from fusiond.plan import SECOND
-from fusiond.sections import Config
+from fusiond.config.schema import Config
+from fusiond.estimator.fusion import Fusion
+from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
+from fusiond.filter.parameters import SECOND
+from fusiond.filter.state import NEVER, T_LAST, FilterState, T
+from fusiond.filter.step import ROW, Kernel, make_kernel
 from fusiond.simulation.scenario import parse
-from fusiond.state import NEVER, T_LAST, FilterState, T
 from fusiond_adapters.logs.write import write_drive
 
 SEED = 11
@@ -302,8 +302,8 @@ def start_lines(repeats: int) -> list[Line]:
     bare = statistics.median(run_python("-c", "pass")[0] for _ in range(repeats))
     lines = []
     for what, code in (
-        ("import the core (fusiond.fusion)", "import fusiond.fusion"),
-        ("import all of replay", "import fusiond.replay"),
+        ("import the core (fusiond.estimator.fusion)", "import fusiond.estimator.fusion"),
+        ("import all of replay", "import fusiond.app.replay.replay"),
         ("fusiond --version", "import fusiond.__main__ as m\ntry: m.main(['--version'])\nexcept SystemExit: pass"),
     ):
         seconds = statistics.median(run_python("-c", code)[0] for _ in range(repeats))

@@ -26,13 +26,13 @@ from typing import BinaryIO
 import msgspec
 
 from benchmarks.latency import CAN_HZ, IMU_HZ, configuration, free_port, process, sent_by_autopilot, turn_wheels
-from fusiond.daemon import Daemon
-from fusiond.messages import StateMessage, encode
-from fusiond.replay import Replay, Wants
-from fusiond.sections import Config
-from fusiond_adapters.can_bus import CanFrame
+from fusiond.app.live.daemon import Daemon
+from fusiond.app.replay.replay import Replay, Wants
+from fusiond.config.schema import Config
+from fusiond.messages.types import StateMessage, encode
+from fusiond_adapters.can.bus import CanFrame
 from fusiond_adapters.logs.merge import open_logs
-from fusiond_adapters.play import PlayedClock
+from fusiond_adapters.logs.play import PlayedClock
 
 SECOND = 1_000_000_000  # ns
 BEGIN_NS = 1_760_000_000 * SECOND

@@ -22,9 +22,10 @@ from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
-from fusiond.client import Client
-from fusiond.estimate import Estimate, Mode, StateEstimate
-from fusiond.messages import (
+from fusiond.app.client import Client
+from fusiond.config.schema import Zenoh
+from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.messages.types import (
     EventMessage,
     HealthMessage,
     InputHealth,
@@ -35,8 +36,7 @@ from fusiond.messages import (
     StateMessage,
     state_message,
 )
-from fusiond.sections import Zenoh
-from fusiond_adapters.zenoh import KIND, ZenohPublisher, open_session
+from fusiond_adapters.zenoh.session import KIND, ZenohPublisher, open_session
 
 GRACE_S = 3.0  # after the last publication, for what is fetched again
 COUNTS = OutcomeCounts(fused=48_211, rejected=37)

@@ -4,9 +4,9 @@ import sys
 
 import numpy as np
 
-from fusiond import config
-from fusiond.clock import Clock
-from fusiond.measurements import GnssVelocity, WheelSpeed
+from fusiond.config import load as config
+from fusiond.events import GnssVelocity, WheelSpeed
+from fusiond.timeline.clock import Clock
 from fusiond_adapters.logs.merge import open_logs
 
 settings = config.load(sys.argv[1])

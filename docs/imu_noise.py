@@ -7,10 +7,10 @@ import sys
 
 import numpy as np
 
-from fusiond import config
-from fusiond.clock import Clock
-from fusiond.measurements import ImuSample
-from fusiond.replay import parse_interval
+from fusiond.app.replay.replay import parse_interval
+from fusiond.config import load as config
+from fusiond.events import ImuSample
+from fusiond.timeline.clock import Clock
 from fusiond_adapters.logs.merge import open_logs
 
 settings = config.load(sys.argv[1])

@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import msgspec
 from msgspec import Meta
 
-from fusiond.sections import Config
+from fusiond.config.schema import Config
+from fusiond.config.toml import Name, Section
 from fusiond.simulation.scenario import Scenario
-from fusiond.toml_file import Name, Section
 
 FOLDER = Path(__file__).parent
 PAGES: dict[str, tuple[type[Section], frozenset[str]]] = {  # page: the whole file's struct, fields that are no keys

@@ -19,17 +19,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from fusiond import config, demo
-from fusiond.bank import alive
-from fusiond.comparison import Truth, Window, displacement, parse_truth
-from fusiond.fusion import state_estimate
-from fusiond.health import STATUSES
-from fusiond.messages import EventMessage, HealthMessage, Message, StateMessage
-from fusiond.replay import Options, Replay, Wants, replay
-from fusiond.report import Summary
+from fusiond.app.demo import demo
+from fusiond.app.replay.comparison import Truth, Window, displacement, parse_truth
+from fusiond.app.replay.replay import Options, Replay, Wants, replay
+from fusiond.app.replay.summary import Summary
+from fusiond.app.top.view import View, screen
+from fusiond.config import load as config
+from fusiond.estimator.fusion import state_estimate
+from fusiond.filter.heading_bank import alive
+from fusiond.filter.source_health import STATUSES
+from fusiond.filter.state import CHOOSING, LAST_VALUE, PHASE
+from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMessage
 from fusiond.simulation.scenario import parse
-from fusiond.state import CHOOSING, LAST_VALUE, PHASE
-from fusiond.top import View, screen
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from fusiond.messages import MESSAGES, schemas
+from fusiond.messages.types import MESSAGES, schemas
 
 FOLDER = Path(__file__).parent / "schema"
 PAGE = Path(__file__).parent / "messages.md"

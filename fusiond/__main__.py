@@ -11,10 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 
-from fusiond import __version__, config
+from fusiond import __version__
+from fusiond.config import load as config
+from fusiond.config.schema import Config
 from fusiond.errors import UnusableError, UsageError
-from fusiond.sections import Config
-from fusiond_adapters import journal
+from fusiond_adapters.host import journal
 
 SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
 
@@ -174,7 +175,7 @@ def run_daemon(arguments: argparse.Namespace) -> None:
     asyncio = _asyncio()
     import numpy  # noqa: F401, PLC0415 - here, not from deep within: there Python maps and unmaps its stack at every call
 
-    from fusiond.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
+    from fusiond.app.live.daemon import Daemon, serve  # noqa: PLC0415 - the other commands need none of its drivers
 
     gc.freeze()
     gc.enable()
@@ -200,7 +201,7 @@ def _asyncio() -> ModuleType:
 
 def run_command(arguments: argparse.Namespace) -> None:
     """Any other command."""
-    from fusiond.commands import COMMANDS  # noqa: PLC0415 - the daemon is up sooner without what only they need
+    from fusiond.app.commands import COMMANDS  # noqa: PLC0415 - the daemon is up sooner without what only they need
 
     COMMANDS[arguments.command](arguments)
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from fractions import Fraction
 
-from fusiond.fusion import Fusion, Receipt
-from fusiond.kernel import Outcome
-from fusiond.measurements import ImuSample, Received
-from fusiond.messages import OutcomeCounts, StateMessage, state_message
-from fusiond.sections import Config
-from fusiond.stored import StoredState
+from fusiond.config.schema import Config
+from fusiond.estimator.fusion import Fusion, Receipt
+from fusiond.events import ImuSample, Received
+from fusiond.filter.step import Outcome
+from fusiond.filter.stored_state import StoredState
+from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
 
 SECOND = 1_000_000_000  # ns
 LONGEST_SILENCE_NS = 60 * SECOND  # ticks go on for so long after an event; a longer hole is passed over

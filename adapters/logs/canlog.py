@@ -29,11 +29,10 @@ from typing import NamedTuple
 import can
 from can.io.blf import BLFParseError
 
-from fusiond.measurements import Received
-from fusiond.sections import Config
-
-from ..can import PDU2, CanDecoder, frame_key, parameter_group
-from . import LogError, LogInput
+from fusiond.config.schema import Config
+from fusiond.events import Received
+from fusiond_adapters.can.decoder import PDU2, CanDecoder, frame_key, parameter_group
+from fusiond_adapters.logs import LogError, LogInput
 
 TEXT = {".asc": "Vector ASC", ".trc": "PEAK TRC", ".csv": "python-can CSV"}
 BINARY = {".blf": "Vector BLF", ".db": "python-can SQLite", ".mf4": "ASAM MDF 4"}

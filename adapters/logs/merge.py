@@ -10,14 +10,13 @@ from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
-from fusiond.measurements import Received
-from fusiond.sections import Config
-
-from ..can import CanDecoder
-from ..mavlink import MavlinkDecoder
-from . import LogError, LogInput, canlog
-from .canlog import read_can_log
-from .tlog import read_tlog
+from fusiond.config.schema import Config
+from fusiond.events import Received
+from fusiond_adapters.can.decoder import CanDecoder
+from fusiond_adapters.logs import LogError, LogInput, canlog
+from fusiond_adapters.logs.canlog import read_can_log
+from fusiond_adapters.logs.tlog import read_tlog
+from fusiond_adapters.mavlink.decoder import MavlinkDecoder
 
 READ_AHEAD = 512  # events
 KNOWN = ".tlog, .log (candump -L), .asc, .blf, .trc, .csv, .db, .mf4; all but .db and .mf4 also with .gz"

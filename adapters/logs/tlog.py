@@ -14,9 +14,9 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator
 from struct import Struct
 
-from fusiond.measurements import Received
-
-from ..mavlink import (
+from fusiond.events import Received
+from fusiond_adapters.logs import LogError, LogInput
+from fusiond_adapters.mavlink.decoder import (
     CHECKSUM,
     HEADER_2,
     LENGTH_KNOWN,
@@ -29,7 +29,6 @@ from ..mavlink import (
     MavlinkDecoder,
     frame_length,
 )
-from . import LogError, LogInput
 
 STAMP = Struct(">Q")  # microseconds of Unix time
 STAMP_SIZE = STAMP.size

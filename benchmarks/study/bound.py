@@ -12,14 +12,11 @@ import numpy as np
 
 from benchmarks.study.runs import start_covariance, true_state
 from benchmarks.study.world import WHEEL_PHASE_S, World
-from fusiond.earth import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array
-from fusiond.elementary import square
-from fusiond.observe import CONSTRAINTS, MODELS
-from fusiond.observe.model import Observation, with_rate_noise
-from fusiond.plan import IMU, MODEL, plan
-from fusiond.rotation import quaternion, skew
-from fusiond.sections import Config
-from fusiond.state import (
+from fusiond.config.schema import Config
+from fusiond.filter.observations import CONSTRAINTS, MODELS
+from fusiond.filter.observations.model import Observation, with_rate_noise
+from fusiond.filter.parameters import IMU, MODEL, plan
+from fusiond.filter.state import (
     ACCEL_BIAS,
     ATTITUDE,
     ERROR_SIZE,
@@ -33,6 +30,9 @@ from fusiond.state import (
     VELOCITY,
     VELOCITY_E,
 )
+from fusiond.maths.portable import square
+from fusiond.maths.rotation import quaternion, skew
+from fusiond.maths.wgs84 import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array
 
 EARTH_SKEW = skew(np.array([0.0, 0.0, EARTH_RATE]))
 

@@ -9,9 +9,8 @@ import numpy as np
 from benchmarks.study import nominal
 from benchmarks.study.consistency import LOOK_PHASE_S, Study, study
 from benchmarks.study.report import Section, figure
-from fusiond.earth import Array
-from fusiond.sections import Config
-from fusiond.state import (
+from fusiond.config.schema import Config
+from fusiond.filter.state import (
     ACCEL_BIAS,
     ANTENNA_ERROR,
     DELAYS_ERROR,
@@ -20,6 +19,7 @@ from fusiond.state import (
     MOUNT_ERROR,
     SCALE,
 )
+from fusiond.maths.wgs84 import Array
 
 AT_S = (5, 15, 30, 60, 115)
 ROUNDS = 2

@@ -10,8 +10,8 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section
 from benchmarks.study.runs import begun, drive, error, spread
 from benchmarks.study.world import GNSS_NAME, T0, Fault, Sensors
-from fusiond.plan import nanoseconds
-from fusiond.state import POSITION, RESETS
+from fusiond.filter.parameters import nanoseconds
+from fusiond.filter.state import POSITION, RESETS
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 START_S, STOP_S, END_S = 40.0, 65.0, 120.0

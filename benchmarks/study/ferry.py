@@ -10,7 +10,7 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section
 from benchmarks.study.runs import Ledger, begun, drive, error, spread
 from benchmarks.study.world import GNSS_NAME, Fault, Sensors
-from fusiond.state import POSITION, RESETS, VELOCITY
+from fusiond.filter.state import POSITION, RESETS, VELOCITY
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 LOOK_S = 0.5

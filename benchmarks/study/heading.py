@@ -10,9 +10,9 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section
 from benchmarks.study.runs import drive, spread
 from benchmarks.study.world import T0, Sensors, World
-from fusiond.fusion import Fusion
-from fusiond.plan import nanoseconds
-from fusiond.sections import Config
+from fusiond.config.schema import Config
+from fusiond.estimator.fusion import Fusion
+from fusiond.filter.parameters import nanoseconds
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 LOOK_S = 0.1

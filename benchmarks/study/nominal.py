@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from fusiond.sections import Config
+from fusiond.config.schema import Config
 from fusiond.simulation.scenario import Scenario
 
 WHEELS: dict[str, dict[str, Any]] = {

@@ -10,7 +10,7 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section, figure
 from benchmarks.study.runs import Ledger, begun, drive, error, spread
 from benchmarks.study.world import GNSS_NAME, Fault, Sensors
-from fusiond.state import POSITION, RESETS
+from fusiond.filter.state import POSITION, RESETS
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 OUTAGES_S = (10.0, 30.0, 60.0, 120.0, 300.0, 600.0)

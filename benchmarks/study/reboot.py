@@ -10,7 +10,7 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section
 from benchmarks.study.runs import begun, drive, error, spread
 from benchmarks.study.world import GNSS_NAME, IMU_NAME, Fault, Sensors
-from fusiond.state import ATTITUDE, PHASE, POSITION, RESETS, RUNNING, VELOCITY
+from fusiond.filter.state import ATTITUDE, PHASE, POSITION, RESETS, RUNNING, VELOCITY
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 SILENT_S = (1.0, 3.0, 8.0)

@@ -11,16 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.study.world import SECOND, T0, World
-from fusiond.earth import Array
-from fusiond.fusion import Fusion
-from fusiond.kernel import Outcome, Rows
-from fusiond.measurements import Measurement
-from fusiond.motion import watch
-from fusiond.plan import Plan, nanoseconds
-from fusiond.rotation import matrix, quaternion, quaternion_exp, quaternion_multiply
-from fusiond.sections import Config
-from fusiond.simulation.scenario import Scenario
-from fusiond.state import (
+from fusiond.config.schema import Config
+from fusiond.estimator.fusion import Fusion
+from fusiond.events import Measurement
+from fusiond.filter.motion_constraints import watch
+from fusiond.filter.parameters import Plan, nanoseconds
+from fusiond.filter.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
     ATTITUDE,
@@ -48,6 +44,10 @@ from fusiond.state import (
     FilterState,
     T,
 )
+from fusiond.filter.step import Outcome, Rows
+from fusiond.maths.rotation import matrix, quaternion, quaternion_exp, quaternion_multiply
+from fusiond.maths.wgs84 import Array
+from fusiond.simulation.scenario import Scenario
 
 BLOCKS = {
     "position": POSITION,

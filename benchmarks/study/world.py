@@ -14,17 +14,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.earth import ECCENTRICITY2, Array
-from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
-from fusiond.plan import plan, scale_state
-from fusiond.sections import Config, Wheel, wheel_groups
+from fusiond.config.schema import Config, Wheel, wheel_groups
+from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
+from fusiond.filter.parameters import plan, scale_state
+from fusiond.filter.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
+from fusiond.maths.wgs84 import ECCENTRICITY2, Array
 from fusiond.simulation import imu as inertial_sensor
 from fusiond.simulation import wgs84
 from fusiond.simulation.gnss import gauss_markov
 from fusiond.simulation.scenario import Imu, Scenario
 from fusiond.simulation.trajectory import Kinematics, Trajectory, blend, turned
 from fusiond.simulation.truth import Motion, inertial
-from fusiond.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
 
 SECOND = 1_000_000_000  # ns
 T0 = 1_760_000_000 * SECOND

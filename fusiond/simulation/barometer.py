@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.earth import Array
-from fusiond.observe.barometric_height import GAS_CONSTANT, LAYERS, NOMINAL_RADIUS, STANDARD_GRAVITY
+from fusiond.filter.observations.barometric_height import GAS_CONSTANT, LAYERS, NOMINAL_RADIUS, STANDARD_GRAVITY
+from fusiond.maths.wgs84 import Array
 from fusiond.simulation.scenario import Barometer
 
 CENTI_CELSIUS = 3200  # of the sensor in its warm box

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fusiond.earth import Array
-from fusiond.measurements import Received
+from fusiond.events import Received
+from fusiond.maths.wgs84 import Array
 from fusiond.simulation import barometer, gnss, imu, wheels
 from fusiond.simulation.chatter import FIRST_ID, TELEMETRY_HZ, traffic_rates
 from fusiond.simulation.gnss import Fixes

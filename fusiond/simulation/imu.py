@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.earth import Array
-from fusiond.measurements import Vector3
+from fusiond.events import Vector3
+from fusiond.maths.wgs84 import Array
 from fusiond.simulation.scenario import Imu
 from fusiond.simulation.truth import Motion
 

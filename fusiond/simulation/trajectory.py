@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusiond.earth import Array
-from fusiond.measurements import Vector3
+from fusiond.events import Vector3
+from fusiond.maths.wgs84 import Array
 from fusiond.simulation.scenario import Scenario
 from fusiond.simulation.wgs84 import radii, wrapped
 

@@ -1,10 +1,10 @@
-"""WGS-84 for whole arrays: radii, gravity, rates; written apart from `fusiond.earth`, so that each checks the other."""
+"""WGS-84 for whole arrays: radii, gravity, rates; apart from `fusiond.maths.wgs84`, so that each checks the other."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from fusiond.earth import EARTH_RATE, EQUATOR_GRAVITY, FLATTENING, GRAVITY_RATIO, SEMI_MAJOR, SOMIGLIANA, Array
+from fusiond.maths.wgs84 import EARTH_RATE, EQUATOR_GRAVITY, FLATTENING, GRAVITY_RATIO, SEMI_MAJOR, SOMIGLIANA, Array
 
 E2 = FLATTENING * (2 - FLATTENING)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.measurements import (
+from fusiond.events import (
     UNIX_CLOCK,
     ClockPair,
     GnssPosition,

@@ -8,14 +8,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from fusiond import config as configuration
-from fusiond.calibration import calibrations
-from fusiond.comparison import TruthReport, Window
-from fusiond.replay import Options, Replay, Wants, parse_withheld, replay
-from fusiond.sections import Config
+from fusiond.app.replay.comparison import TruthReport, Window
+from fusiond.app.replay.replay import Options, Replay, Wants, parse_withheld, replay
+from fusiond.config import load as configuration
+from fusiond.config.schema import Config
+from fusiond.filter.calibration import calibrations
 from fusiond_adapters.logs.merge import open_logs
+from tests.helpers.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 DRIVE = ROOT.parent / "shared" / "data" / "comma2k19-rav4"
 CONFIG = ROOT / "configs" / "rav4.toml"
 WINDOW = Window(10.0, 30.0)

@@ -7,11 +7,20 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.fusion import Fusion
-from fusiond.rotation import matrix
-from fusiond.state import ACCEL_BIAS_B, ATTITUDE, GYRO_BIAS_B, POSITION, POSITION_E, QUATERNION_EB, VELOCITY, VELOCITY_E
+from fusiond.estimator.fusion import Fusion
+from fusiond.filter.state import (
+    ACCEL_BIAS_B,
+    ATTITUDE,
+    GYRO_BIAS_B,
+    POSITION,
+    POSITION_E,
+    QUATERNION_EB,
+    VELOCITY,
+    VELOCITY_E,
+)
+from fusiond.maths.rotation import matrix
 from tests.conftest import needs_compiled
-from tests.streams import SECOND, T0, Drive, config, measurements, town
+from tests.helpers.streams import SECOND, T0, Drive, config, measurements, town
 
 RUNS, SECONDS = 10, 60.0
 BLOCKS = {"position": POSITION, "velocity": VELOCITY, "attitude": ATTITUDE}

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusiond import config
-from fusiond.demo import DRIVE, LOGS
-from fusiond.kernel import compiled_available
-from fusiond.replay import Options, replay
+from fusiond.app.demo.demo import DRIVE, LOGS
+from fusiond.app.replay.replay import Options, replay
+from fusiond.config import load as config
+from fusiond.filter.step import compiled_available
 
 GOLDEN = Path(__file__).parent / "demo.csv"
 

@@ -15,12 +15,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fusiond.fusion import Fusion
-from fusiond.measurements import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Payload, WheelSpeed
-from fusiond.sections import Config
-from fusiond.state import PHASE, RUNNING, T
+from fusiond.config.schema import Config
+from fusiond.estimator.fusion import Fusion
+from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Payload, WheelSpeed
+from fusiond.filter.state import PHASE, RUNNING, T
 from tests.conftest import needs_compiled
-from tests.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
+from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
 
 PREFIX_S, LENGTH_S = 2.0, 2.5  # of a case: in order, so that the filter runs; and shuffled
 QUIET = settings(deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))

@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.earth import ecef, mat_ne
-from fusiond.kernel import ROW, compiled_available, make_kernel, run_one
-from fusiond.plan import IMU, MODEL, plan
-from fusiond.sections import Config
+from fusiond.config.schema import Config
+from fusiond.filter.parameters import IMU, MODEL, plan
+from fusiond.filter.state import BLOWN, POSITION_E, RESETS, VELOCITY_E, FilterState
+from fusiond.filter.step import ROW, compiled_available, make_kernel, run_one
+from fusiond.maths.wgs84 import ecef, mat_ne
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import parse
 from fusiond.simulation.truth import Truth
-from fusiond.state import BLOWN, POSITION_E, RESETS, VELOCITY_E, FilterState
 
 IMU_HZ, WHEEL_HZ, GNSS_HZ, SEED = 400, 100, 5, 20
 ACCEL_NOISE, GYRO_NOISE, WHEEL_SIGMA, POSITION_SIGMA, VELOCITY_SIGMA = 0.02, 5e-4, 0.05, 1.0, 0.1

@@ -26,7 +26,7 @@ from reader import Truth, reading
 from vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from fusiond.messages import StateMessage
+    from fusiond.messages.types import StateMessage
 
 ETC = Path("/etc/fusiond")
 PORT, ENDPOINT = 14550, "tcp/127.0.0.1:7447"
@@ -136,9 +136,9 @@ def trace(folder: Path) -> str:
 def replayed_alike(file: Path, box: Path, payloads: list[bytes]) -> str:
     """How many of the states that a replay of the black box publishes are, byte for byte, those received live. Those
     that Zenoh dropped on their way are told. Raises Failed."""
-    from fusiond import config  # noqa: PLC0415 - installed by the check before
-    from fusiond.messages import encode  # noqa: PLC0415
-    from fusiond.replay import Replay, Wants  # noqa: PLC0415
+    from fusiond.app.replay.replay import Replay, Wants  # noqa: PLC0415
+    from fusiond.config import load as config  # noqa: PLC0415 - installed by the check before
+    from fusiond.messages.types import encode  # noqa: PLC0415
     from fusiond_adapters.logs.merge import open_logs  # noqa: PLC0415
 
     settings = config.load(file)

@@ -1,0 +1,1 @@
+"""CAN: buses and drivers, DBC decoding, checksums."""

@@ -1,0 +1,118 @@
+"""CAN live: one bus's frames, what is made of them, and what its error frames tell.
+
+python-can and cantools are slow to import, and so only `prepare` does, in the input's thread: after a restart the other
+inputs are fused again, and the state is published, without waiting for them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from threading import Event
+from typing import TYPE_CHECKING
+
+from fusiond.config.schema import Config
+from fusiond.events import Received
+from fusiond.ports.inputs import Inbox
+from fusiond_adapters.can.kernel_socket import CanFrame
+from fusiond_adapters.host.clock import HostClock
+
+if TYPE_CHECKING:
+    from fusiond_adapters.can.decoder import CanDecoder
+    from fusiond_adapters.can.driver import CanDriver
+
+CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100  # classes of error frames, linux/can/error.h
+OVERFLOW, WARNING, PASSIVE, ACTIVE = 0x03, 0x0C, 0x30, 0x40  # what byte 1 says of the controller
+ERROR_FLAG = 0x20000000  # in an id as candump writes it
+
+log = logging.getLogger("fusiond")
+
+
+class CanBus:
+    """One [can.NAME]."""
+
+    def __init__(self, config: Config, bus: str, inbox: Inbox[CanFrame], clock: HostClock) -> None:
+        self.name = bus
+        self.file = "can.log"
+        self.inbox = inbox
+        self.decoder: CanDecoder | None = None  # until it is prepared
+        self.state = "active"  # of the controller, by its error frames
+        self.sessions = 0
+        self._seen: Counter[str] = Counter()
+        self._channel = config.can[bus].log_channel or bus
+        self._config, self._clock = config, clock
+        self._driver: CanDriver | None = None
+        self.configure(config)
+
+    def configure(self, config: Config) -> None:
+        """Take interface and channel of a configuration, for the sessions to come."""
+        settings = self._settings = config.can[self.name]
+        where = " ".join(filter(None, (settings.interface, settings.channel, settings.config_context)))
+        self.about = f"CAN {self.name} ({where or 'as python-can is configured'})"
+
+    def prepare(self) -> None:
+        """Load the DBC files. Raises ConfigError where they do not fit."""
+        from fusiond_adapters.can.decoder import CanDecoder  # noqa: PLC0415 - see above
+        from fusiond_adapters.can.driver import CanDriver  # noqa: PLC0415
+
+        self.decoder = CanDecoder(self._config, self.name)
+        self._driver = CanDriver(self.decoder, self.inbox, self._clock)
+
+    def session(self, stop: Event) -> None:
+        """Open the bus, read it until told to stop, close it. Raises InputLost."""
+        assert self._driver is not None
+        with self._driver.opened(self._settings) as bus:
+            self.sessions += 1
+            self.state = "active"
+            self._driver.read(bus, stop)
+
+    def decode(self, item: CanFrame, t_ns: int) -> list[Received]:
+        """The wheels in a frame; an error frame has none, and is counted."""
+        if item.is_error:
+            self._take_error(item)
+            return []
+        if item.is_remote:
+            self._seen["remote frames"] += 1
+            return []
+        assert self.decoder is not None  # no frame comes before
+        return self.decoder.decode(item.arbitration_id, item.is_extended, item.data, t_ns)
+
+    def _take_error(self, item: CanFrame) -> None:
+        """Count an error frame; one line in the log when the controller's state changes."""
+        self._seen["error frames"] += 1
+        classes, detail = item.arbitration_id, item.data[1] if len(item.data) > 1 else 0
+        controller = detail if classes & CONTROLLER else 0
+        self._seen["controller overflow"] += bool(controller & OVERFLOW)
+        state = self.state
+        if classes & BUS_OFF:
+            self._seen["bus off"] += 1
+            state = "bus-off"
+        elif classes & RESTARTED:
+            self._seen["restarted"] += 1
+            state = "active"
+        elif controller & PASSIVE:
+            self._seen["error passive"] += 1
+            state = "error-passive"
+        elif controller & WARNING:
+            self._seen["error warning"] += 1
+            state = "error-warning"
+        elif controller & ACTIVE:
+            state = "active"
+        if state != self.state:
+            log.log(logging.INFO if state == "active" else logging.WARNING, "%s: the controller is %s", self.about, state)
+            self.state = state
+
+    def record(self, item: CanFrame, t_ns: int) -> bytes:
+        """A line of `candump -L`."""
+        number = item.arbitration_id | (ERROR_FLAG if item.is_error else 0)
+        wide = item.is_extended or item.is_error
+        marks = "#R" if item.is_remote else "#" if item.fd_flags is None else f"##{item.fd_flags:X}"
+        seconds, rest = divmod(t_ns, 10**9)
+        stamp = f"({seconds}.{rest // 1000:06d})"
+        return f"{stamp} {self._channel} {number:0{8 if wide else 3}X}{marks}{item.data.hex().upper()}\n".encode()
+
+    def counts(self) -> dict[str, int]:
+        """What became of the frames so far, and of the bus."""
+        own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
+        decoded = self.decoder.counts if self.decoder else {}
+        return {**own, **{name: count for name, count in self._seen.items() if count}, **decoded}

@@ -1,0 +1,281 @@
+"""CAN in: `Received` wheel speeds out of data frames, by DBC files. No I/O after construction.
+
+Which signal is which wheel, in which unit, and which signals vouch for it, is configuration. A frame is decoded once
+for all the wheels in it, and of its signals only those in use; frames that carry none are passed over by their id.
+
+J1939 messages (by the bus's key `j1939`, or by the DBC's VFrameFormat) are known by their PGN, whatever
+the priority and the sender. Of their speeds, raw values whose top byte is above 0xFA mean an error or "not available".
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, TypeVar, cast
+
+import cantools
+from cantools.database.can import Database, Message, Signal
+
+from fusiond.config.schema import Config, Wheel
+from fusiond.config.toml import ConfigError
+from fusiond.events import AnyPayload, Invalid, Received, WheelSpeed
+from fusiond_adapters.can.checksums import is_right
+
+Item = TypeVar("Item")
+
+EXTENDED = 1 << 31  # set in the keys of 29-bit ids, as in a DBC file and in Linux
+
+METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
+DBC_UNITS = {  # as DBC files write them, in lower case: as the configuration does
+    "m/s": "m/s", "mps": "m/s", "km/h": "km/h", "kph": "km/h", "kmh": "km/h", "kmph": "km/h", "km/hr": "km/h",
+    "mph": "mph", "mi/h": "mph", "rad/s": "rad/s", "rads/s": "rad/s", "rad/sec": "rad/s",
+    "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "rev/min": "rpm",
+}  # fmt: skip
+J1939_VALID_TOP = 0xFA  # greatest top byte of a J1939 value
+PDU2 = 240  # J1939: a PDU format from here on has no destination
+PER_RADIUS = {"rad/s": 1.0, "rpm": 2 * math.pi / 60}  # times the radius in metres
+
+
+def frame_key(arbitration_id: int, is_extended: bool) -> int:
+    """One number for an id of either length."""
+    return arbitration_id | EXTENDED if is_extended else arbitration_id
+
+
+def parameter_group(arbitration_id: int) -> int:
+    """The J1939 parameter group number (PGN) of a 29-bit id."""
+    number = arbitration_id >> 8 & 0x3FFFF
+    return number if number >> 8 & 0xFF >= PDU2 else number & 0x3FF00
+
+
+class CanDecoder:
+    """The wheels of one [can.NAME] bus.
+
+    `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
+    `counts` tells what became of the frames, `warnings` what is odd about the configuration. Raises ConfigError where the
+    DBC files cannot be read or lack something.
+    """
+
+    def __init__(self, config: Config, bus: str, sequences: dict[str, int] | None = None) -> None:
+        self.bus = bus
+        self._sequences = {} if sequences is None else sequences
+        self._frames: dict[int, _Frame] = {}
+        self._groups: dict[int, _Frame] = {}  # J1939, by PGN
+        self.warnings: list[str] = []
+        self.counts = dict.fromkeys(("decoded", "other ids", "undecodable"), 0)
+        wheels = {name: wheel for name, wheel in config.wheel.items() if wheel.bus == bus}
+        if not wheels:
+            return
+        messages = _load([config.path(name) for name in config.can[bus].dbc], f"can.{bus}.dbc")
+        for name, wheel in wheels.items():
+            message = _find(wheel.message or "", messages, f"wheel.{name}.message", "message")
+            j1939 = message.is_extended_frame and (config.can[bus].j1939 or message.protocol == "j1939")
+            frames, key = self._frames, frame_key(message.frame_id, message.is_extended_frame)
+            if j1939:
+                frames, key = self._groups, parameter_group(message.frame_id)
+            alike = [*frames[key].readers] if key in frames else []
+            frames[key] = _Frame(message, [*alike, _WheelReader(name, wheel, message, j1939)])
+            self.warnings += frames[key].readers[-1].warnings
+
+    @property
+    def keys(self) -> frozenset[int]:
+        """The `frame_key` of every frame that carries a wheel, but for those of J1939."""
+        return frozenset(self._frames)
+
+    @property
+    def groups(self) -> frozenset[int]:
+        """The PGN of every J1939 frame that carries a wheel."""
+        return frozenset(self._groups)
+
+    def decode(self, arbitration_id: int, is_extended: bool, data: bytes, t_receive_ns: int) -> list[Received]:
+        """The wheels in one data frame; none where its id is of no use."""
+        frame = self._frames.get(frame_key(arbitration_id, is_extended))
+        if frame is None and self._groups and is_extended:
+            frame = self._groups.get(parameter_group(arbitration_id))
+        if frame is None:
+            self.counts["other ids"] += 1
+            return []
+        try:
+            signals = frame.signals(data)
+        except cantools.Error:
+            self.counts["undecodable"] += 1
+            return [self._event(reader.name, t_receive_ns, Invalid("undecodable")) for reader in frame.readers]
+        self.counts["decoded"] += 1
+        short = len(data) < frame.size
+        if frame.whole and not short and not frame.checksums:
+            return [self._event(reader.name, t_receive_ns, reader.judge(signals)) for reader in frame.readers]
+        broken = [kind for kind in frame.checksums if not is_right(kind, arbitration_id, data)]
+        events = []
+        for reader in frame.readers:
+            payload = Invalid("checksum") if reader.checksum in broken else reader.read(signals, short)
+            if payload is not None:
+                events.append(self._event(reader.name, t_receive_ns, payload))
+        return events
+
+    def _event(self, source: str, t_receive_ns: int, payload: AnyPayload) -> Received:
+        sequence = self._sequences[source] = self._sequences.get(source, -1) + 1
+        return Received(source, sequence, "", None, t_receive_ns, payload)
+
+
+class _Frame:
+    """One frame with wheels in it, and how the signals in use are cut out of its data."""
+
+    def __init__(self, message: Message, readers: Sequence[_WheelReader]) -> None:
+        self.readers = readers
+        self.checksums = sorted({reader.checksum for reader in readers if reader.checksum is not None})
+        self.size = message.length
+        names = {name for reader in readers for name in reader.needed}
+        fields = [_field(signal, message.length) for signal in message.signals if signal.name in names]
+        plain = [field for field in fields if field is not None]
+        self.whole = not message.is_multiplexed() and len(plain) == len(fields)  # no signal is missing but from short ones
+        if not self.whole:
+            decode = partial(message.decode_simple, decode_choices=False, allow_truncated=True)
+            self.signals = cast("Callable[[bytes], Mapping[str, float]]", decode)  # without choices all are numbers
+        else:
+            self.signals = partial(_cut, plain, message.length)
+
+
+class _Field(NamedTuple):
+    """Where the bits of one integer signal lie in the frame's data followed by the same bytes backwards, as one number."""
+
+    name: str
+    end: int  # bits that a frame must have to hold it
+    shift: int
+    mask: int
+    sign: int  # its bit, or 0
+    scale: float
+    offset: float
+
+
+def _field(signal: Signal, size: int) -> _Field | None:
+    """A signal of a message of `size` bytes, as cantools decodes it; None where it is no integer or leaves the frame."""
+    length, is_big = signal.length, signal.byte_order == "big_endian"
+    begin = 8 * (signal.start // 8) + 7 - signal.start % 8 if is_big else signal.start  # counted from the first bit sent
+    end = begin + length
+    if signal.is_float or end > 8 * size:
+        return None
+    shift = 16 * size - end if is_big else begin
+    sign = 1 << length - 1 if signal.is_signed else 0
+    scale, offset = signal.conversion.scale, signal.conversion.offset
+    if float(scale).is_integer() and float(offset).is_integer():
+        scale, offset = int(scale), int(offset)
+    return _Field(signal.name, end, shift, (1 << length) - 1, sign, scale, offset)
+
+
+def _cut(fields: Sequence[_Field], size: int, data: bytes) -> dict[str, float]:
+    """The signals of a message of `size` bytes; those alone that a short frame has."""
+    bits = 8 * len(data)
+    if len(data) != size:
+        data = data[:size].ljust(size, b"\0")
+    number = int.from_bytes(data + data[::-1], "big")
+    found = {}
+    for name, end, shift, mask, sign, scale, offset in fields:
+        if end <= bits:
+            raw = number >> shift & mask
+            found[name] = (raw - 2 * (raw & sign)) * scale + offset
+    return found
+
+
+class _WheelReader:
+    """One wheel: decoded signals to WheelSpeed, or why not."""
+
+    def __init__(self, name: str, wheel: Wheel, message: Message, j1939: bool) -> None:
+        self.name = name
+        self.checksum = wheel.checksum
+        self._wheel = wheel
+        self._factor = _factor(wheel)
+        self._signal = wheel.signal or ""
+        signals = {signal.name: signal for signal in message.signals}
+        for key in ("signal", "direction_signal", "valid_signal", "counter_signal", "base_signal"):
+            wanted = getattr(wheel, key)
+            if wanted is not None:
+                _find(wanted, signals, f"wheel.{name}.{key}", f"signal of {message.name}")
+        guards = (wheel.direction_signal, wheel.valid_signal, wheel.counter_signal, wheel.base_signal)
+        self.needed = [self._signal, *(guard for guard in guards if guard is not None)]
+        self._counter: float | None = None  # last value of counter_signal
+        speeds = [signals[speed] for speed in (self._signal, wheel.base_signal) if speed is not None]
+        self._limits = list(_limits(speeds, wheel.not_available_from, j1939))
+        self.warnings = list(_unit_warnings(name, wheel, speeds))
+
+    def read(self, signals: Mapping[str, float], short: bool) -> WheelSpeed | Invalid | None:
+        """None where the frame, multiplexed, carries other signals this time."""
+        for name in self.needed:
+            if name not in signals:
+                return Invalid("short frame") if short else None
+        return self.judge(signals)
+
+    def judge(self, signals: Mapping[str, float]) -> WheelSpeed | Invalid:
+        """The speed, if the signals, of which none that is needed is missing, vouch for it."""
+        wheel = self._wheel
+        if wheel.counter_signal is not None:
+            last, self._counter = self._counter, signals[wheel.counter_signal]
+            if self._counter == last:
+                return Invalid("stale counter")
+        if wheel.valid_signal is not None and signals[wheel.valid_signal] != wheel.valid_value:
+            return Invalid("valid_signal")
+        for limited, sign, limit in self._limits:
+            if signals[limited] * sign >= limit:
+                return Invalid("not available")
+        value = signals[self._signal]
+        if wheel.base_signal is not None:
+            value += signals[wheel.base_signal]
+        speed = value * self._factor
+        if not math.isfinite(speed):
+            return Invalid("not finite")
+        if wheel.direction_signal is not None and signals[wheel.direction_signal] == wheel.reverse_value:
+            speed = -speed
+        return WheelSpeed(speed)
+
+
+def _limits(speeds: list[Signal], given: int | None, j1939: bool) -> Iterator[tuple[str, int, float]]:
+    """Of signals that have values which mean "not available": name, sign, and the least value times sign that does."""
+    for place, signal in enumerate(speeds):
+        raw = given if place == 0 else None
+        if raw is None and j1939 and signal.length >= 8:
+            raw = (J1939_VALID_TOP + 1) << signal.length - 8
+        if raw is not None:
+            sign = 1 if signal.scale > 0 else -1
+            yield signal.name, sign, sign * float(signal.offset + (raw - 0.5) * signal.scale)
+
+
+def _unit_warnings(name: str, wheel: Wheel, speeds: list[Signal]) -> Iterator[str]:
+    for signal in speeds:
+        unit = DBC_UNITS.get((signal.unit or "").strip().lower())
+        if unit is not None and unit != wheel.unit:
+            yield f"wheel.{name}.unit: is {wheel.unit}, but the DBC says that {signal.name} is in {signal.unit}"
+
+
+def _factor(wheel: Wheel) -> float:
+    """Metres per second in one unit of the decoded signal."""
+    if wheel.unit in METRES_PER_SECOND:
+        return METRES_PER_SECOND[wheel.unit] * wheel.scale
+    if wheel.radius_m is None:
+        raise ConfigError(f"{wheel.unit} needs radius_m")
+    return PER_RADIUS[wheel.unit] * wheel.radius_m * wheel.scale
+
+
+def _load(paths: Iterable[Path], key: str) -> dict[str, Message]:
+    """The messages of all the DBC files. Overlapping signals are tolerated: they are common, and mostly elsewhere."""
+    messages: dict[str, Message] = {}
+    for path in paths:
+        try:
+            database = cantools.database.load_file(path, database_format="dbc", strict=False)
+        except OSError as error:
+            raise ConfigError(f"{key}: {path}: cannot be read: {error.strerror}") from error
+        except (cantools.Error, ValueError, LookupError) as error:
+            raise ConfigError(f"{key}: {path}: not a valid DBC file: {error}") from error
+        if isinstance(database, Database):
+            messages = {message.name: message for message in database.messages} | messages
+    return messages
+
+
+def _find(name: str, known: Mapping[str, Item], key: str, kind: str) -> Item:
+    """The item of that name, or a ConfigError that names those there are, the nearest first."""
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    names = [*near, *sorted(set(known) - set(near))]
+    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    raise ConfigError(f"{key}: there is no {kind} '{name}' in the DBC; there is: {', '.join(names[:10])}{more}")

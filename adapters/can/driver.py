@@ -1,0 +1,101 @@
+"""python-can: opens a bus, and reads it into an inbox.
+
+The bus is opened by python-can's own configuration (files, environment, `config_context`); what [can.NAME] gives goes
+first. Where the interface can filter, only frames of the wheels' ids, and error frames, come in. The kernel's stamp of
+a frame is mapped to the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and
+sets its filters, and `CanSocket` reads it, so that frames lost in the kernel's queue are seen.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Event
+from typing import Any
+
+import can
+
+from fusiond.config.schema import Can
+from fusiond.ports.inputs import POLL_S, Inbox, InputLost
+from fusiond_adapters.can.decoder import EXTENDED, PDU2, CanDecoder
+from fusiond_adapters.can.kernel_socket import CanFrame, CanSocket
+from fusiond_adapters.host.clock import HostClock
+
+ID_BITS = 0x1FFFFFFF
+STANDARD_BITS = 0x7FF
+GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # what of a J1939 id tells its PGN, without and with a destination
+BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
+
+
+class CanDriver:
+    """Opens and reads the bus of whose frames `decoder` finds the wheels."""
+
+    def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: HostClock) -> None:
+        self._decoder, self._inbox, self._clock = decoder, inbox, clock
+
+    @contextmanager
+    def opened(self, settings: Can) -> Iterator[can.BusABC]:
+        """The bus, as long as it is in use. Raises InputLost where it cannot be opened, and where it is lost later."""
+        try:
+            bus = self._open(settings)
+        except (can.CanError, OSError, ValueError, ImportError) as error:
+            raise InputLost(f"cannot be opened: {error}") from error
+        try:
+            yield bus
+        except (can.CanError, OSError) as error:
+            raise InputLost(f"lost: {error}") from error
+        finally:
+            bus.shutdown()
+
+    def read(self, bus: can.BusABC, stop: Event) -> None:
+        """Leave frames in the inbox until told to stop."""
+        opened = getattr(bus, "socket", None)
+        if isinstance(opened, socket.socket) and opened.family == socket.AF_CAN:
+            self._read_socket(CanSocket(opened), stop)
+        while not stop.is_set():
+            message = bus.recv(POLL_S)
+            if message is not None:
+                self._inbox.put(self._clock.from_wall_ns(round(message.timestamp * 1e9)), _frame(message))
+
+    def _read_socket(self, reader: CanSocket, stop: Event) -> None:
+        before = self._inbox.missed
+        while not stop.is_set():
+            for wall_ns, frame in reader.read(POLL_S):
+                self._inbox.put(self._clock.now_ns() if wall_ns is None else self._clock.from_wall_ns(wall_ns), frame)
+            self._inbox.missed = before + reader.dropped
+
+    def _open(self, settings: Can) -> can.BusABC:
+        more: dict[str, Any] = {"fd": True} if settings.fd else {}
+        if settings.bitrate is not None:
+            more["bitrate"] = settings.bitrate
+        filters = [
+            {
+                "can_id": key & ID_BITS,
+                "can_mask": ID_BITS if key & EXTENDED else STANDARD_BITS,
+                "extended": bool(key & EXTENDED),
+            }
+            for key in sorted(self._decoder.keys)
+        ]
+        filters += [
+            {"can_id": group << 8, "can_mask": GROUP_BITS if group >> 8 & 0xFF >= PDU2 else FORMAT_BITS, "extended": True}
+            for group in sorted(self._decoder.groups)
+        ]
+        bus: can.BusABC = can.Bus(
+            interface=settings.interface,
+            channel=settings.channel,
+            config_context=settings.config_context,
+            can_filters=filters or None,
+            **more,
+        )
+        return bus
+
+
+def _frame(message: can.Message) -> CanFrame:
+    flags = None
+    if message.is_fd:
+        flags = BIT_RATE_SWITCH * message.bitrate_switch + ERROR_STATE * message.error_state_indicator
+    data = b"" if message.is_remote_frame else bytes(message.data)
+    return CanFrame(
+        message.arbitration_id, message.is_extended_id, data, flags, message.is_remote_frame, message.is_error_frame
+    )

@@ -1,0 +1,1 @@
+"""Foxglove: published messages in Foxglove's schemas, a live server, a layout."""

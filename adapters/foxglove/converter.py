@@ -1,0 +1,279 @@
+"""What Foxglove is shown, in a file or live: the published messages, and the same in Foxglove's own schemas, as JSON.
+
+Foxglove's 3-D panel wants a flat world with z up. `local_enu` is one: axes east, north, up at the origin, which is where
+the first state was; `base_link` is the body with axes forward, left, up. Both are right at any distance from the origin.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+from msgspec import Meta, Struct
+
+from fusiond.config.schema import Config
+from fusiond.messages.local_frame import ENU_FLU, LocalFrame
+from fusiond.messages.types import (
+    MESSAGES,
+    EventMessage,
+    HealthMessage,
+    InnovationMessage,
+    Message,
+    SettledMessage,
+    Severity,
+    State,
+    StateAtInstant,
+    StateMessage,
+    encode,
+)
+
+SECOND = 1_000_000_000  # ns
+ROOT, BODY = "local_enu", "base_link"  # frames
+KNOWN = 3  # position_covariance_type
+LEVELS: dict[Severity, int] = {"info": 2, "notice": 2, "warning": 3, "critical": 4}  # of foxglove.Log
+
+Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
+
+
+class Channel(NamedTuple):
+    """A topic and what its messages look like: JSON by a JSON Schema that Foxglove can read."""
+
+    topic: str
+    schema_name: str
+    schema: bytes
+
+
+class Record(NamedTuple):
+    """A message on a topic."""
+
+    topic: str
+    log_ns: int  # the instant it tells of
+    publish_ns: int  # when it was told
+    data: bytes
+
+
+# --- Foxglove's schemas
+
+
+class Time(Struct, frozen=True):
+    """An instant of Unix time."""
+
+    sec: int
+    nsec: int
+
+
+class Vector3(Struct, frozen=True):
+    """m, or m/s."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Quaternion(Struct, frozen=True):
+    """Of the rotation from the child's or body's axes to the parent's."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class PoseOf(Struct, frozen=True):
+    """Place and attitude."""
+
+    position: Vector3
+    orientation: Quaternion
+
+
+class LocationFix(Struct, frozen=True):
+    """A place on the earth, on the map."""
+
+    timestamp: Time
+    frame_id: str
+    latitude: Annotated[float, Meta(description="deg")]
+    longitude: Annotated[float, Meta(description="deg")]
+    altitude: Annotated[float, Meta(description="m")]
+    position_covariance: Annotated[Nine, Meta(description="m^2, east, north, up, row by row")]
+    position_covariance_type: Annotated[int, Meta(description="3: known")]
+    heading: Annotated[float, Meta(description="rad, clockwise from north")]
+    velocity: Annotated[Vector3, Meta(description="m/s, east, north, up")]
+
+
+class PoseInFrame(Struct, frozen=True):
+    """The body in the local frame."""
+
+    timestamp: Time
+    frame_id: str
+    pose: PoseOf
+
+
+class FrameTransform(Struct, frozen=True):
+    """Where the child frame lies in the parent frame."""
+
+    timestamp: Time
+    parent_frame_id: str
+    child_frame_id: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+class Log(Struct, frozen=True):
+    """An event."""
+
+    timestamp: Time
+    level: Annotated[int, Meta(description="2 information, 3 warning, 4 error")]
+    message: str
+    name: str
+    file: str
+    line: int
+
+
+LOCATION, ORIGIN, POSE, TRANSFORM, LOG = (f"/fusiond/{name}" for name in ("location", "origin", "pose", "tf", "log"))
+FOXGLOVE: dict[str, type[Struct]] = {
+    LOCATION: LocationFix, ORIGIN: LocationFix, POSE: PoseInFrame, TRANSFORM: FrameTransform, LOG: Log,
+}  # fmt: skip
+TOPICS: dict[type[Message], str] = {
+    kind: f"/fusiond/{name}"
+    for name, kind in MESSAGES.items()
+    if kind in (StateMessage, SettledMessage, HealthMessage, InnovationMessage, EventMessage)
+}
+SHOWN = tuple(TOPICS)  # what an outbox lets in
+
+_encode = msgspec.json.Encoder().encode
+
+
+def innovations_topic(source: str) -> str:
+    """The topic of a source's innovations; a dot would have to be quoted in Foxglove's message paths."""
+    return f"{TOPICS[InnovationMessage]}/{source.replace('.', '/')}"
+
+
+def judged(config: Config) -> list[str]:
+    """The sources that have innovations: all but the IMU."""
+    return [source for source in config.sources() if source not in config.imu]
+
+
+def channels(config: Config) -> list[Channel]:
+    """Every topic there is."""
+    found = [
+        Channel(topic, name := f"foxglove.{kind.__name__}", readable_schema(kind, name)) for topic, kind in FOXGLOVE.items()
+    ]
+    for kind, topic in TOPICS.items():
+        topics = [innovations_topic(source) for source in judged(config)] if kind is InnovationMessage else [topic]
+        name = f"fusiond.{kind.__name__}"
+        schema = readable_schema(kind, name, config.sources())
+        found += [Channel(topic, name, schema) for topic in topics]
+    return found
+
+
+def readable_schema(kind: type[Struct], title: str, sources: Iterable[str] = ()) -> bytes:
+    """The JSON Schema of a type as Foxglove reads it: an object at the top, nothing by reference, one type for each field
+    (any may be null), arrays of one kind of item, and the fields of `sources` by name."""
+    whole = msgspec.json.schema(kind)
+    definitions = whole.pop("$defs")
+
+    def plain(schema: dict[str, Any], name: str = "") -> dict[str, Any]:
+        if "$ref" in schema:
+            return plain({**definitions[schema["$ref"].rpartition("/")[2]], **_without(schema, "$ref")}, name)
+        if "anyOf" in schema:
+            (inner,) = (option for option in schema["anyOf"] if option != {"type": "null"})
+            return plain({**_without(schema, "anyOf"), **inner}, name)
+        schema = _without(schema, "default", "required", "title")
+        if "enum" in schema:
+            schema["type"] = "string"
+        if schema.get("type") == "array":
+            items = schema.pop("prefixItems", [schema["items"]])[0]
+            schema["items"] = plain(items)
+        if schema.get("type") == "object":
+            inner = schema.pop("additionalProperties", {})
+            named = dict.fromkeys(sources, inner) if name == "sources" and isinstance(inner, dict) else {}
+            fields = {**schema.get("properties", {}), **named}
+            schema["properties"] = {key: plain(field, key) for key, field in fields.items()}
+        return schema
+
+    return json.dumps({"title": title, **plain(whole)}, separators=(",", ":")).encode()
+
+
+def _without(schema: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: value for key, value in schema.items() if key not in keys}
+
+
+# --- Messages to records
+
+
+class _Origin(NamedTuple):
+    frame: LocalFrame
+    state: State  # at its origin
+
+
+class Converter:
+    """Published messages to what Foxglove is shown. Of states, at most `rate_hz` a second are, besides those that tell of
+    another mode or of a reset; None: all of them."""
+
+    def __init__(self, rate_hz: float | None = None) -> None:
+        self._period_ns = SECOND / rate_hz if rate_hz else 1.0
+        self._turns: dict[type[Message], tuple[object, ...]] = {}  # by kind: what makes a state due when it changes
+        self._origin: _Origin | None = None
+        self._origin_told: int | None = None  # second in which it was last
+        self._tick_ns: int | None = None  # the latest
+
+    def records(self, message: Message) -> Iterator[Record]:
+        """What is shown of a message; nothing if its turn has not come."""
+        if not isinstance(message, StateAtInstant | HealthMessage | InnovationMessage | EventMessage):
+            return
+        if isinstance(message, StateMessage):
+            self._tick_ns = message.t_ns  # of a tick it comes first
+        if isinstance(message, StateAtInstant) and not self._is_due(message):
+            return
+        log_ns, publish_ns = message.t_ns, self._tick_ns or message.t_ns
+        topic = innovations_topic(message.source) if isinstance(message, InnovationMessage) else TOPICS[type(message)]
+        yield Record(topic, log_ns, publish_ns, encode(message, "json"))
+        if isinstance(message, EventMessage):
+            log = Log(_time(log_ns), LEVELS[message.severity], message.text, message.vehicle, "", 0)
+            yield Record(LOG, log_ns, publish_ns, _encode(log))
+        elif isinstance(message, StateMessage) and message.state is not None:
+            for topic, shown in self._shown(message.t_ns, message.state):
+                yield Record(topic, log_ns, publish_ns, _encode(shown))
+
+    def _is_due(self, message: StateAtInstant) -> bool:
+        turn = message.mode, message.resets, message.t_ns // self._period_ns
+        last, self._turns[type(message)] = self._turns.get(type(message)), turn
+        return turn != last
+
+    def _shown(self, t_ns: int, state: State) -> Iterator[tuple[str, Struct]]:
+        time = _time(t_ns)
+        if self._origin is None:
+            self._origin = _Origin(LocalFrame.at(state, ENU_FLU), state)
+        frame, place = self._origin.frame, self._origin.state
+        if self._origin_told != time.sec:  # once a second, for whoever comes late
+            self._origin_told = time.sec
+            fix = _fix(time, ROOT, place, frame)
+            yield ORIGIN, msgspec.structs.replace(fix, heading=0.0, velocity=Vector3(0.0, 0.0, 0.0))
+        local = frame.state(state)
+        w, x, y, z = local.quaternion_lb
+        where, turned = Vector3(*local.position_l), Quaternion(x, y, z, w)
+        yield TRANSFORM, FrameTransform(time, ROOT, BODY, where, turned)
+        yield POSE, PoseInFrame(time, ROOT, PoseOf(where, turned))
+        yield LOCATION, _fix(time, BODY, state, frame)
+
+
+def _fix(time: Time, frame_id: str, state: State, frame: LocalFrame) -> LocationFix:
+    north, east, down = state.velocity_ned_mps
+    return LocationFix(
+        timestamp=time,
+        frame_id=frame_id,
+        latitude=state.lat_deg,
+        longitude=state.lon_deg,
+        altitude=state.height_m,
+        position_covariance=list(frame.covariance_axes(state.covariance_position_m2)),
+        position_covariance_type=KNOWN,
+        heading=math.radians(state.yaw_deg),
+        velocity=Vector3(east, north, -down),
+    )
+
+
+def _time(t_ns: int) -> Time:
+    return Time(*divmod(t_ns, SECOND))

@@ -1,0 +1,82 @@
+"""Foxglove live: a WebSocket server with the topics of the MCAP files. Needs the extra `foxglove`.
+
+The server is the SDK's own, in threads outside Python; to a client that is slow it drops the oldest messages.
+"""
+
+from __future__ import annotations
+
+from threading import Event
+
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond_adapters.foxglove.converter import SHOWN, Converter, channels
+
+try:
+    from foxglove import Channel, Context, Schema, start_server
+except ModuleNotFoundError as missing:
+    raise ConfigError("[foxglove] needs the extra foxglove: pip install 'fusiond[foxglove]'") from missing
+
+MOST_WAITING = 1024  # messages between the estimator and the server, and as many again to each client
+
+
+class FoxgloveServer:
+    """The live output."""
+
+    name = "foxglove"
+
+    def __init__(self, config: Config) -> None:
+        self.about = f"Foxglove server on {config.foxglove.host}:{config.foxglove.port}"
+        self.outbox = Outbox(MOST_WAITING, SHOWN)
+        self.shown = 0  # records given to the server
+        self.url: str | None = None  # while it runs
+        self._config = config
+        self._converter = Converter(config.foxglove.rate_hz)
+
+    def session(self, stop: Event) -> None:
+        """Serve until told to stop. Raises OutputLost."""
+        section, context = self._config.foxglove, Context()
+        try:
+            server = start_server(
+                name=f"fusiond {self._config.vehicle.name}",
+                host=section.host,
+                port=section.port,
+                context=context,
+                message_backlog_size=MOST_WAITING,
+            )
+        except RuntimeError as error:  # all that the SDK raises
+            raise OutputLost(f"{self.about}: {error}") from error
+        try:
+            self.url = f"ws://{section.host}:{server.port}"
+            self._serve(context, stop)
+        finally:
+            self.url = None
+            server.stop()
+
+    def counts(self) -> dict[str, int]:
+        """Records."""
+        return {"records": self.shown}
+
+    def notes(self) -> dict[str, str]:
+        """Where to connect to."""
+        return {"url": self.url} if self.url else {}
+
+    def _serve(self, context: Context, stop: Event) -> None:
+        topics = {
+            channel.topic: Channel(
+                channel.topic,
+                schema=Schema(name=channel.schema_name, encoding="jsonschema", data=channel.schema),
+                message_encoding="json",
+                context=context,
+            )
+            for channel in channels(self._config)
+        }
+        stopping = False
+        while not stopping:
+            stopping = stop.is_set()  # before the last look, so that it misses nothing
+            for message in self.outbox.take(POLL_S):
+                for record in self._converter.records(message):
+                    topics[record.topic].log(record.data, log_time=record.log_ns)
+                    self.shown += 1
+        for topic in topics.values():
+            topic.close()

@@ -1,0 +1,1 @@
+"""The host: its clock, its journal, its service manager."""

@@ -1,0 +1,249 @@
+"""The state back to the autopilot, as a source of its own estimator; and what that estimator makes of it.
+
+Messages go out on the open link of a MAVLink input, from this output's own thread. Only a state that is fit is sent;
+why it is not is told in the health, and once in a STATUSTEXT. Whether the autopilot uses what it gets is read from its
+EKF_STATUS_REPORT or ESTIMATOR_STATUS, which the link asks for (`mavlink_talk`), and from what ArduPilot's EKF3 says in
+STATUSTEXTs: "is using external nav data", "stopped aiding".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from threading import Event
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from fusiond.config.schema import Autopilot, Config
+from fusiond.estimator.solution import Mode
+from fusiond.messages.types import State, StateMessage
+from fusiond.ports.outputs import POLL_S, Outbox
+from fusiond_adapters.mavlink.answers import Parameter
+from fusiond_adapters.mavlink.decoder import message_id
+from fusiond_adapters.mavlink.link import MavlinkLink
+from fusiond_adapters.mavlink.outgoing import (
+    FORMS,
+    Origin,
+    Pace,
+    gps_input,
+    odometry,
+    set_origin,
+    status_texts,
+    vision_position,
+)
+
+SECOND = 1_000_000_000  # ns
+OUTBOX = 64  # messages
+LEAST_HZ = 4.0  # ArduPilot takes a source for dead below that
+STALE_NS = SECOND  # a state that waited for longer is not sent
+SILENT_NS = 5 * SECOND  # an estimator's status older than this counts no more
+TEXT_NS = 5 * SECOND  # between two STATUSTEXTs
+ORIGIN_NS = 2 * SECOND  # between two SET_GPS_GLOBAL_ORIGINs, until the autopilot names its origin
+ORIGIN_APART_M = 1.0  # more than this between the autopilot's origin and ours is told
+GATE = 1.0  # of a test ratio
+ARDUPILOT_UNINITIALISED = 1024  # EKF_STATUS_FLAGS: what ESTIMATOR_STATUS uses the bit for is a GPS glitch
+HAS_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
+NAMES = {dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", dialect.MAV_AUTOPILOT_PX4: "px4"}
+EXTERNAL_NAV = re.compile(r"EKF\d IMU\d+ is using external nav data")
+STOPPED_AIDING = re.compile(r"EKF\d IMU\d+ stopped aiding")
+
+HEARD = {
+    dialect.MAVLINK_MSG_ID_HEARTBEAT,
+    dialect.MAVLINK_MSG_ID_STATUSTEXT,
+    dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+    dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+}
+
+
+def unfit(message: StateMessage, limits: Autopilot) -> tuple[str, str] | None:
+    """Why a state is not to be sent: a word for the kind of reason, and the whole of it. None: it is fit."""
+    state = message.state
+    if state is None or message.mode in (Mode.ALIGNING, Mode.LOST):
+        return message.mode.value, message.fault or message.mode.value.replace("_", " ")
+    if message.mode is Mode.DEAD_RECKONING and not limits.dead_reckoning:
+        return "dead_reckoning", "dead reckoning"
+    if message.age_ms is None or message.age_ms > limits.age_ms:
+        return "age", f"the last IMU sample is older than {limits.age_ms:g} ms"
+    horizontal = max(state.sigma_position_ned_m[:2])
+    for name, sigma, limit, unit in (
+        ("position", horizontal, limits.position_sigma_m, "m"),
+        ("velocity", state.sigma_velocity_mps, limits.velocity_sigma_mps, "m/s"),
+        ("yaw", state.sigma_yaw_deg, limits.yaw_sigma_deg, "deg"),
+    ):
+        if sigma > limit:
+            return name, f"{name} sigma {sigma:.3g} {unit}, limit {limit:g} {unit}"
+    return None
+
+
+def quality(state: State, limits: Autopilot) -> int:
+    """1 to 100: 100 where all sigmas are zero, 1 where the worst of them is at its limit."""
+    worst = max(
+        max(state.sigma_position_ned_m[:2]) / limits.position_sigma_m,
+        state.sigma_velocity_mps / limits.velocity_sigma_mps,
+        state.sigma_yaw_deg / limits.yaw_sigma_deg,
+    )
+    return max(1, round(100 - 99 * worst))
+
+
+class Readback:
+    """What the autopilot tells of its own estimator. `hear` is called by the link's thread."""
+
+    def __init__(self, link: MavlinkLink, kind: str) -> None:
+        self.origin: Origin | None = None  # of its local frame; its height is above the sea
+        self._link, self._kind = link, kind
+        self._parser = dialect.MAVLink(None)
+        self._is = kind  # whose heartbeat it is
+        self._said_external: bool | None = None
+        self._report: tuple[int, int, Sequence[float]] | None = None  # stamp, flags, ratios
+
+    def hear(self, frame: bytes, t_ns: int) -> None:
+        """Take a frame of the link."""
+        if message_id(frame) not in HEARD:
+            return
+        try:
+            message = self._parser.decode(bytearray(frame))
+        except dialect.MAVError:
+            return  # a dialect's message that shares the number, or a frame that was torn
+        if (message.get_srcSystem(), message.get_srcComponent()) != self._link.talk.target:
+            return
+        kind = message.get_msgId()
+        if kind == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+            self._is = NAMES.get(message.autopilot, self._kind)
+        elif kind == dialect.MAVLINK_MSG_ID_STATUSTEXT:
+            if EXTERNAL_NAV.search(message.text):
+                self._said_external = True
+            elif STOPPED_AIDING.search(message.text):
+                self._said_external = False
+        elif kind == dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
+            self.origin = Origin(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+        elif kind == dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
+            flags = message.flags & ~ARDUPILOT_UNINITIALISED
+            if message.flags & ARDUPILOT_UNINITIALISED:
+                flags = 0
+            ratios = message.velocity_variance, message.pos_horiz_variance, message.pos_vert_variance
+            self._report = t_ns, flags, ratios
+        else:
+            ratios = message.vel_ratio, message.pos_horiz_ratio, message.pos_vert_ratio
+            self._report = t_ns, message.flags, ratios
+
+    def verdict(self, now_ns: int) -> str:
+        """Does the autopilot use what it is sent? The first word is yes, no, likely or unknown."""
+        if self._is != self._kind:
+            return f"no: the autopilot says it is {self._is}, [autopilot] kind is {self._kind}"
+        report = self._report
+        if report is None or now_ns - report[0] > SILENT_NS:
+            return "unknown: the autopilot does not tell of its estimator"
+        _, flags, ratios = report
+        worst = max((ratio for ratio in ratios if math.isfinite(ratio)), default=math.nan)
+        objections = (
+            (not flags & dialect.ESTIMATOR_ATTITUDE, "its estimator is not initialised"),
+            (flags & dialect.ESTIMATOR_CONST_POS_MODE, "it assumes a constant position"),
+            (not flags & HAS_POSITION, "it has no horizontal position"),
+            (self._said_external is False, "it said that it stopped aiding"),
+            (worst >= GATE, f"it rejects measurements, worst test ratio {worst:.2f}"),
+        )
+        found = next((text for applies, text in objections if applies), None)
+        if found:
+            return f"no: {found}"
+        if self._said_external:
+            return f"yes: it says so; worst test ratio {worst:.2f}"
+        return f"likely: it has a position, worst test ratio {worst:.2f}; it does not say from whom"
+
+
+class AutopilotOutput:
+    """[autopilot]. `rate_hz` may be changed while it runs."""
+
+    name = "autopilot"
+
+    def __init__(self, config: Config, link: MavlinkLink, now: Callable[[], int]) -> None:
+        self._settings, self._geoid_m = config.autopilot, config.vehicle.geoid_m
+        self._link, self._now = link, now
+        self._form = FORMS[self._settings.kind]
+        self.outbox = Outbox(OUTBOX, (StateMessage,))
+        self.about = f"{self._settings.message} to {self._settings.kind} over MAVLink {self._settings.link}"
+        self.pace, self._most_hz = Pace(self._settings.rate_hz), config.publish.rate_hz
+        self.readback = Readback(link, self._settings.kind)
+        self.origin: Origin | None = None  # of the local frame: the first fit position, kept
+        self._counts = dict.fromkeys(("sent", "not fit", "stale", "link closed or full"), 0)
+        self._unfit: tuple[str, str] | None = ("none", "no state yet")
+        self._passed = True  # the link took the last one
+        self._told = "none"  # the kind of reason last told in a STATUSTEXT
+        self._texts, self._next_text_ns, self._next_origin_ns = 0, 0, 0
+
+    def session(self, stop: Event) -> None:
+        """Send what comes until told to stop. The link is opened and closed by its input: what comes meanwhile is lost
+        and counted."""
+        self._link.listeners.append(self.readback.hear)
+        try:
+            while not stop.is_set():
+                for message in self.outbox.take(POLL_S):
+                    if isinstance(message, StateMessage):
+                        self.offer(message)
+        finally:
+            self._link.listeners.remove(self.readback.hear)
+
+    def offer(self, message: StateMessage) -> None:
+        """Send a state, if it is fit and due; or else tell why not."""
+        if self._now() - message.t_ns > STALE_NS:
+            self._counts["stale"] += 1
+            return
+        self._unfit = unfit(message, self._settings)
+        self._tell(message.t_ns)
+        if not self.pace.due(message.t_ns):
+            return
+        if self._unfit or message.state is None:
+            self._counts["not fit"] += 1
+            return
+        if self.origin is None:
+            self.origin = Origin.of(message.state)
+        if self._settings.set_origin and self.readback.origin is None and message.t_ns >= self._next_origin_ns:
+            self._next_origin_ns = message.t_ns + ORIGIN_NS
+            self._link.send(set_origin(message, self.origin, self._geoid_m, (self._link.talk.target or (0, 0))[0]))
+        self._passed = self._link.send(self._packed(message, message.state, self.origin))
+        self._counts["sent" if self._passed else "link closed or full"] += 1
+
+    def _packed(self, message: StateMessage, state: State, origin: Origin) -> Any:
+        if self._settings.message == "gps_input":
+            return gps_input(message, state, self._geoid_m, self._settings.gps_id)
+        if self._settings.message == "vision_position":
+            return vision_position(message, state, origin, self._form)
+        return odometry(message, state, origin, self._form, quality(state, self._settings))
+
+    def _tell(self, t_ns: int) -> None:
+        """In a STATUSTEXT, whether states are sent from now on; not more often than people can read."""
+        word = self._unfit[0] if self._unfit else ""
+        if word == self._told or t_ns < self._next_text_ns:
+            return
+        text = f"fusiond: not sent to the autopilot: {self._unfit[1]}" if self._unfit else "fusiond: sent to the autopilot"
+        severity = dialect.MAV_SEVERITY_WARNING if self._unfit else dialect.MAV_SEVERITY_INFO
+        self._texts = self._texts % 0xFFFF + 1
+        if all(self._link.send(chunk) for chunk in status_texts(severity, text, self._texts)):
+            self._told = word
+            self._next_text_ns = t_ns + TEXT_NS
+
+    def parameter(self) -> Parameter:
+        """Its rate, to be offered to a ground station."""
+        return Parameter("AP_RATE_HZ", lambda: self.pace.rate_hz, self._set_rate, LEAST_HZ, self._most_hz)
+
+    def _set_rate(self, rate_hz: float) -> None:
+        self.pace.rate_hz = rate_hz
+
+    def counts(self) -> dict[str, int]:
+        """What became of the states that were due; `not fit` are those that must not be sent."""
+        return dict(self._counts)
+
+    def notes(self) -> dict[str, str]:
+        """Whether states are sent, whether the autopilot uses them, and where its local frame begins, if not with ours."""
+        unfit_now = self._unfit
+        obstacle = unfit_now[1] if unfit_now else "" if self._passed else "the link is closed or full"
+        notes = {"sending": f"no: {obstacle}" if obstacle else "yes", "used": self.readback.verdict(self._now())}
+        theirs, ours = self.readback.origin, self.origin
+        if theirs and ours:
+            north, east = self._form.on(ours, theirs.latitude_deg, theirs.longitude_deg)
+            apart = (north * north + east * east) ** 0.5
+            if apart > ORIGIN_APART_M and self._settings.message != "gps_input":
+                notes["origin"] = f"the autopilot's local frame begins {apart:.1f} m from ours"
+        return notes

@@ -1,0 +1,312 @@
+"""Telemetry for a ground station: position, velocity, attitude with their covariances, the estimator's status, events as
+texts, and answers to commands and parameter requests.
+
+It goes over a connection of its own, or over the open link of a MAVLink input, where the autopilot routes it. Nothing
+that would be taken for the autopilot's is sent under the vehicle's system id: the marker on the map is a vehicle with a
+system id of its own. Heartbeats are sent as long as states come from the estimator, and stop when they do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from threading import Event
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import common
+
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond.estimator.solution import Mode
+from fusiond.messages.types import EventMessage, HealthMessage, Message, Severity, State, StateMessage
+from fusiond.ports.inputs import LiveInput
+from fusiond.ports.outputs import Outbox, OutputLost
+from fusiond_adapters.mavlink.answers import HANDLED, Parameter, Responder
+from fusiond_adapters.mavlink.decoder import NO_AUTOPILOT, Dialect, FrameSplitter, message_id
+from fusiond_adapters.mavlink.link import MavlinkLink, link_of
+from fusiond_adapters.mavlink.outgoing import (
+    Origin,
+    Pace,
+    Ratios,
+    attitude_quaternion,
+    estimator_status,
+    global_position,
+    local_position_ned,
+    marker,
+    status_texts,
+)
+from fusiond_adapters.mavlink.transport import Transport, opener
+
+SECOND = 1_000_000_000  # ns
+OUTBOX = 256  # messages
+POLL_S = 0.05  # between two looks for what the ground station says
+HEARTBEAT_NS = SECOND
+ALIVE_NS = 2 * SECOND  # without a state for so long, no heartbeats
+STATUS_HZ = 1.0
+MARKER_HZ = 2.0
+MOST_HEARD = 256  # frames that wait for an answer
+AUTOPILOT_COMPONENT = 1  # the only one of which QGroundControl makes a vehicle on the map
+SEVERITY: dict[Severity, int] = {
+    "critical": common.MAV_SEVERITY_CRITICAL,
+    "warning": common.MAV_SEVERITY_WARNING,
+    "notice": common.MAV_SEVERITY_NOTICE,
+    "info": common.MAV_SEVERITY_INFO,
+}
+STATUS = {
+    Mode.ALIGNING: common.MAV_STATE_CALIBRATING,
+    Mode.NOMINAL: common.MAV_STATE_ACTIVE,
+    Mode.DEAD_RECKONING: common.MAV_STATE_ACTIVE,
+    Mode.LOST: common.MAV_STATE_CRITICAL,
+}
+GLOBAL, LOCAL = common.MAVLINK_MSG_ID_GLOBAL_POSITION_INT_COV, common.MAVLINK_MSG_ID_LOCAL_POSITION_NED_COV
+ATTITUDE, ESTIMATOR = common.MAVLINK_MSG_ID_ATTITUDE_QUATERNION_COV, common.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+
+
+class Way(Protocol):
+    """To the ground station and back. `send` may raise OSError or EOFError where the way is this output's own."""
+
+    @property
+    def identity(self) -> tuple[int, int]:
+        """System and component we speak as."""
+
+    beats: bool  # heartbeats are ours to send
+
+    def send(self, message: Any, voice: Any = None) -> bool: ...
+    def heard(self) -> list[bytes]: ...
+    def close(self) -> None: ...
+
+
+class LinkWay:
+    """Over the open link of an input, whose own talk sends our heartbeats."""
+
+    beats = False
+
+    def __init__(self, link: MavlinkLink, rouse: Callable[[], None]) -> None:
+        self._link, self._rouse = link, rouse
+        self._heard: deque[bytes] = deque(maxlen=MOST_HEARD)
+        self.send = link.send
+        link.listeners.append(self._listen)
+
+    @property
+    def identity(self) -> tuple[int, int]:
+        return self._link.talk.identity
+
+    def _listen(self, frame: bytes, _t_ns: int) -> None:
+        """From the link's thread."""
+        if message_id(frame) in HANDLED:
+            self._heard.append(frame)
+            self._rouse()
+
+    def heard(self) -> list[bytes]:
+        return [self._heard.popleft() for _ in range(len(self._heard))]
+
+    def close(self) -> None:
+        self._link.listeners.remove(self._listen)
+
+
+class OwnWay:
+    """A connection of its own."""
+
+    beats = True
+
+    def __init__(self, transport: Transport, system: Callable[[], int], component: int) -> None:
+        self._transport, self._system = transport, system
+        self._voice = common.MAVLink(None, srcSystem=system(), srcComponent=component)
+        self._splitter = FrameSplitter(Dialect("common"))
+
+    @property
+    def identity(self) -> tuple[int, int]:
+        return self._system(), self._voice.srcComponent
+
+    def send(self, message: Any, voice: Any = None) -> bool:
+        voice = voice or self._voice
+        self._voice.srcSystem = self._system()
+        packed = bytes(message.pack(voice))
+        voice.seq = (voice.seq + 1) & 0xFF
+        return self._transport.write(packed)
+
+    def heard(self) -> list[bytes]:
+        frames = [frame for chunk in self._transport.read(0) for frame in self._splitter.feed(chunk)]
+        return [frame for frame in frames if message_id(frame) in HANDLED]
+
+    def close(self) -> None:
+        self._transport.close()
+
+
+class GroundStation:
+    """[ground_station]. `parameters` are offered besides its own. Raises ConfigError where the connection is none."""
+
+    name = "ground_station"
+
+    def __init__(
+        self,
+        config: Config,
+        inputs: Mapping[str, LiveInput[Any]],
+        now: Callable[[], int],
+        parameters: Sequence[Parameter] = (),
+    ) -> None:
+        self._config, self._settings = config, config.ground_station
+        self._geoid_m = config.vehicle.geoid_m
+        self._links = [link_of(inputs, name) for name in config.mavlink]
+        self._now = now
+        self.outbox = Outbox(OUTBOX, (StateMessage, HealthMessage, EventMessage))
+        self._open = self._opener()
+        over = f"MAVLink {self._settings.link}" if self._settings.link else self._settings.connection
+        self.about = f"ground station over {over}"
+        rate_hz = self._settings.rate_hz
+        self.paces = {GLOBAL: Pace(rate_hz), LOCAL: Pace(rate_hz), ATTITUDE: Pace(rate_hz), ESTIMATOR: Pace(STATUS_HZ)}
+        self._responder = Responder([*self._parameters(), *parameters], self.paces)
+        self._parser = common.MAVLink(None)
+        self._marker = common.MAVLink(None, srcSystem=self._settings.marker_system, srcComponent=AUTOPILOT_COMPONENT)
+        self._marker_pace = Pace(MARKER_HZ if self._settings.marker_system else 0.0)
+        self._origin: Origin | None = None  # of the local frame: the first state not lost, kept
+        self._ratios = Ratios()
+        self._mode = Mode.ALIGNING
+        self._state_ns: int | None = None  # when the last state was taken from the outbox
+        self._beat_ns, self._texts = 0, 0
+        self._counts = dict.fromkeys(("sent", "lost", "texts", "requests"), 0)
+
+    def session(self, stop: Event) -> None:
+        """Send what comes, answer what is asked, until told to stop. Raises OutputLost."""
+        try:
+            way = self._open()
+        except OSError as error:
+            raise OutputLost(f"cannot be opened: {error}") from error
+        try:
+            while not stop.is_set():
+                self._turn(way, POLL_S)
+            self._turn(way, 0)
+        except (OSError, EOFError) as error:
+            raise OutputLost(f"lost: {error}") from error
+        finally:
+            way.close()
+
+    def _turn(self, way: Way, patience_s: float) -> None:
+        for message in self.outbox.take(patience_s):
+            self._take(way, message)
+        for frame in way.heard():
+            self._answer(way, frame)
+        self._beat(way)
+
+    def _opener(self) -> Callable[[], Way]:
+        settings = self._settings
+        if settings.link is not None:
+            link = next(link for link in self._links if link.name == settings.link)
+            return lambda: LinkWay(link, self.outbox.rouse)
+        try:
+            open_transport = opener(settings.connection or "", settings.baud)
+        except ValueError as error:
+            raise ConfigError(f"ground_station.connection: {error}") from error
+        return lambda: OwnWay(open_transport(), self._system, settings.component)
+
+    def _system(self) -> int:
+        """Our system id on a connection of our own: as configured, or the autopilot's, or 1 as long as that is unknown."""
+        known = (link.talk.target[0] for link in self._links if link.talk.target)
+        return self._settings.system or next(known, 1)
+
+    # --- What it sends
+
+    def _take(self, way: Way, message: Message) -> None:
+        if isinstance(message, StateMessage):
+            self._take_state(way, message)
+        elif isinstance(message, HealthMessage):
+            self._ratios = ratios(message, self._config)
+        elif isinstance(message, EventMessage):
+            self._texts = self._texts % 0xFFFF + 1
+            self._counts["texts"] += 1
+            for chunk in status_texts(SEVERITY[message.severity], f"fusiond: {message.text}", self._texts):
+                self._send(way, chunk)
+
+    def _take_state(self, way: Way, message: StateMessage) -> None:
+        self._mode, self._state_ns = message.mode, self._now()
+        if self._due(ESTIMATOR, message.t_ns):
+            self._send(way, estimator_status(message, self._ratios))
+        state = message.state
+        if state is None or message.mode is Mode.LOST:
+            return
+        origin = self._origin = self._origin or Origin.of(state)
+        self._send_state(way, message, state, origin)
+        if self._marker_pace.due(message.t_ns):
+            self._send(way, marker(message, state, origin, self._geoid_m), self._marker)
+
+    def _send_state(self, way: Way, message: StateMessage, state: State, origin: Origin) -> None:
+        if self._due(GLOBAL, message.t_ns):
+            self._send(way, global_position(message, state, origin, self._geoid_m))
+        if self._due(LOCAL, message.t_ns):
+            self._send(way, local_position_ned(message, state, origin))
+        if self._due(ATTITUDE, message.t_ns):
+            self._send(way, attitude_quaternion(message, state))
+
+    def _due(self, number: int, t_ns: int) -> bool:
+        """Is a message due by its pace, or asked for?"""
+        due = self.paces[number].due(t_ns)
+        if number in self._responder.requested:
+            self._responder.requested.discard(number)
+            return True
+        return due
+
+    def _beat(self, way: Way) -> None:
+        """Heartbeats, as long as the estimator's states come."""
+        now = self._now()
+        if self._state_ns is None or now - self._state_ns > ALIVE_NS or now < self._beat_ns:
+            return
+        self._beat_ns = now + HEARTBEAT_NS
+        status = STATUS[self._mode]
+        if way.beats:
+            kind = common.MAV_TYPE_ONBOARD_CONTROLLER
+            self._send(way, common.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, 0, status, 3))
+        if self._settings.marker_system:
+            kind = common.MAV_TYPE_GROUND_ROVER
+            beat = common.MAVLink_heartbeat_message(kind, common.MAV_AUTOPILOT_GENERIC, 0, 0, status, 3)
+            self._send(way, beat, self._marker)
+
+    def _send(self, way: Way, message: Any, voice: Any = None) -> None:
+        self._counts["sent" if way.send(message, voice) else "lost"] += 1
+
+    # --- What it answers
+
+    def _answer(self, way: Way, frame: bytes) -> None:
+        try:
+            message = self._parser.decode(bytearray(frame))
+        except common.MAVError:
+            return
+        self._counts["requests"] += 1
+        for answer in self._responder.answers(message, way.identity):
+            self._send(way, answer)
+        if self._settings.marker_system:
+            for answer in self._responder.answers(message, (self._settings.marker_system, AUTOPILOT_COMPONENT)):
+                self._send(way, answer, self._marker)
+
+    def _parameters(self) -> list[Parameter]:
+        publish_hz = self._config.publish.rate_hz
+        return [
+            Parameter("FUS_RATE_HZ", lambda: publish_hz),
+            Parameter("FUS_HORIZON_S", lambda: self._config.filter.horizon_s),
+            Parameter("GS_RATE_HZ", lambda: self.paces[GLOBAL].rate_hz, self._set_rate, 0.1, publish_hz),
+        ]
+
+    def _set_rate(self, rate_hz: float) -> None:
+        for number in (GLOBAL, LOCAL, ATTITUDE):
+            self.paces[number].rate_hz = rate_hz
+
+    def counts(self) -> dict[str, int]:
+        """Messages sent and lost, texts, requests heard."""
+        return dict(self._counts)
+
+    def notes(self) -> dict[str, str]:
+        """Nothing: the counts tell it all."""
+        return {}
+
+
+def ratios(health: HealthMessage, config: Config) -> Ratios:
+    """The greatest test ratios of the sources that are present, in sigmas over the gate's."""
+
+    def greatest(names: list[str]) -> float:
+        known = [health.sources[name] for name in names if name in health.sources]
+        found = [source.test_ratio for source in known if source.present and source.test_ratio is not None]
+        return math.sqrt(max(found)) if found else math.nan
+
+    position = [f"{name}.position" for name in config.gnss]
+    velocity = [f"{name}.velocity" for name in config.gnss] + list(config.wheel)
+    return Ratios(greatest(velocity), greatest(position), greatest([*position, *config.barometer]))

@@ -1,0 +1,134 @@
+"""MAVLink live: one link's thread, from a transport to frames in the inbox, and back what fusiond has to say."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from threading import Event, Lock
+from typing import Any
+
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond.events import Received
+from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput
+from fusiond_adapters.host.clock import HostClock
+from fusiond_adapters.logs.tlog import STAMP
+from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder
+from fusiond_adapters.mavlink.talk import MavlinkTalk
+from fusiond_adapters.mavlink.transport import Transport, opener
+
+log = logging.getLogger("fusiond")
+
+
+class MavlinkLink:
+    """One [mavlink.NAME]. `alive` tells whether the estimator works: only then are heartbeats sent. `listeners` are
+    called with every frame that comes in and its stamp, in the link's thread: they must not wait.
+
+    Raises ConfigError where the connection string is none, or the dialect lacks a wanted message.
+    """
+
+    def __init__(
+        self, config: Config, link: str, inbox: Inbox[bytes], clock: HostClock, alive: Callable[[], bool]
+    ) -> None:
+        self.name = link
+        self.file = f"{link}.tlog"
+        self.inbox = inbox
+        self.decoder = MavlinkDecoder(config, link)
+        self.listeners: list[Callable[[bytes, int], None]] = []
+        self.sessions = self.skipped_bytes = self.sent = 0
+        self._clock, self._alive = clock, alive
+        self._sending = Lock()  # guards the way out: what is packed next, and the transport while it is written to
+        self._transport: Transport | None = None
+        self.configure(config)
+
+    def configure(self, config: Config) -> None:
+        """Take connection, own ids and requests of a configuration, for the sessions to come. Raises ConfigError."""
+        settings = config.mavlink[self.name]
+        try:
+            self._open = opener(settings.connection, settings.baud)
+        except ValueError as error:
+            raise ConfigError(f"mavlink.{self.name}.connection: {error}") from error
+        self.about = f"MAVLink {self.name} ({settings.connection})"
+        self.talk = MavlinkTalk(config, self.name)
+
+    def prepare(self) -> None:
+        """Nothing takes long."""
+
+    def session(self, stop: Event) -> None:
+        """Open the link, read it until told to stop, close it. Raises InputLost."""
+        try:
+            transport = self._open()
+        except OSError as error:
+            raise InputLost(f"cannot be opened: {_reason(error)}") from error
+        self.sessions += 1
+        try:
+            self._transport = transport
+            self._serve(transport, stop)
+        except (OSError, EOFError) as error:
+            raise InputLost(f"lost: {_reason(error)}") from error
+        finally:
+            with self._sending:
+                self._transport = None
+                transport.close()
+
+    def send(self, message: Any, voice: Any = None) -> bool:
+        """Send a pymavlink message, from any thread, as fusiond or with a voice (a pymavlink MAVLink) of one's own. Never
+        waits for the peer. False: the link is closed or takes nothing more, and the message is lost."""
+        with self._sending:
+            if self._transport is None:
+                return False
+            try:
+                taken = self._transport.write(self.talk.pack(message, voice))
+            except (OSError, EOFError):
+                return False  # the link's own thread finds it lost
+            self.sent += taken
+            return taken
+
+    def _serve(self, transport: Transport, stop: Event) -> None:
+        splitter = FrameSplitter(self.decoder.dialect)
+        skipped_before = self.skipped_bytes
+        while not stop.is_set():
+            chunks = transport.read(POLL_S)
+            t_ns = self._clock.now_ns()
+            for chunk in chunks:
+                for frame in splitter.feed(chunk):
+                    if self.talk.signing and not self.talk.signing.accepts(frame):
+                        continue
+                    self.inbox.put(t_ns, frame)
+                    with self._sending:  # it may pack an answer
+                        self.talk.hear(frame, t_ns)
+                    for listen in self.listeners:
+                        listen(frame, t_ns)
+            self.skipped_bytes = skipped_before + splitter.skipped_bytes
+            while self.talk.news:
+                log.info("%s: %s", self.about, self.talk.news.pop(0))
+            with self._sending:
+                for said in self.talk.say(self._clock.now_ns(), alive=self._alive()):
+                    self.sent += transport.write(said)
+
+    def decode(self, item: bytes, t_ns: int) -> list[Received]:
+        """The events in a frame."""
+        return self.decoder.decode(item, t_ns)
+
+    def record(self, item: bytes, t_ns: int) -> bytes:
+        """A record of a .tlog."""
+        return STAMP.pack(t_ns // 1000) + item
+
+    def counts(self) -> dict[str, int]:
+        """What became of the frames so far, and of the link."""
+        own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
+        asked = {f"asked for {name}": wanted.asked for name, wanted in self.talk.wanted.items()}
+        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.talk.wanted.items()}
+        signing = self.talk.signing.counts if self.talk.signing else {}
+        return {**own, "reboots": self.talk.reboots, **asked, **rates, **signing, **self.decoder.counts}
+
+
+def link_of(inputs: Mapping[str, LiveInput[Any]], name: str) -> MavlinkLink:
+    """The link [mavlink.NAME] among the inputs of a run."""
+    link = inputs[f"mavlink.{name}"]
+    assert isinstance(link, MavlinkLink)
+    return link
+
+
+def _reason(error: OSError | EOFError) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__

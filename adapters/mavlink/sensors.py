@@ -1,0 +1,229 @@
+"""The sensors of an autopilot: the fields of each MAVLink message that carries one, to events. No I/O."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from fusiond.config.schema import Barometer, Config, Gnss, Imu, Wheel
+from fusiond.events import (
+    AnyPayload,
+    GnssPosition,
+    GnssVelocity,
+    ImuSample,
+    Invalid,
+    Pressure,
+    Received,
+    Vector3,
+    WheelSpeed,
+)
+
+SECOND = 1_000_000_000  # ns
+MILLI_G = 9.80665e-3  # m/s^2
+UNKNOWN_U16 = 65535
+ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
+SHORTEST_NS = 2_000_000  # a message that repeats the one before sooner than this is a copy of it
+LONGEST_NS = SECOND  # the mean speed over a longer interval tells little of the speed at its middle
+RESET_M = 1.0  # a counter that falls to exactly 0 from farther off has been reset
+PASCAL = 100.0  # in a hectopascal
+FREEZING = 273.15  # K
+COLDEST, HOTTEST = 180.0, 400.0  # K, of a sensor that works
+LEAST_PRESSURE, MOST_PRESSURE = 1_000.0, 120_000.0  # Pa: 31 km up, below the Dead Sea
+
+_AXES = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro")
+_IMU_STAMP = {"HIGHRES_IMU": "time_usec", "RAW_IMU": "time_usec"}
+_IMU_EXTRA = {"HIGHRES_IMU": ("fields_updated", "id")}
+GNSS_FIELDS = (
+    "time_usec", "fix_type", "lat", "lon", "alt", "vel", "cog",
+    "alt_ellipsoid", "h_acc", "v_acc", "vel_acc",  # extensions
+)  # fmt: skip
+WHEEL_DISTANCE = "WHEEL_DISTANCE"
+WHEEL_FIELDS = ("time_usec", "count", "distance")
+PRESSURE_FIELDS = ("time_boot_ms", "press_abs", "temperature")
+
+Stamp = tuple[str, int | None]  # clock, stamp [ns]
+
+
+class Decoder(Protocol):
+    """What a handler needs of `MavlinkDecoder`."""
+
+    counts: dict[str, int]
+
+    def event(self, source: str, stamp: Stamp, t_receive_ns: int, payload: AnyPayload) -> Received: ...
+    def stamp(self, time_us: int) -> Stamp: ...
+
+
+def imu_fields(message: str) -> tuple[str, ...]:
+    """What `ImuHandler` takes of a message."""
+    return (_IMU_STAMP.get(message, "time_boot_ms"), *_AXES, *_IMU_EXTRA.get(message, ()))
+
+
+class ImuHandler:
+    """One [imu.NAME]: fields to ImuSample."""
+
+    def __init__(self, decoder: Decoder, name: str, imu: Imu) -> None:
+        self._decoder, self._name, self._imu = decoder, name, imu
+        self._mat_bs = _rotation(imu.rotation_deg) if any(imu.rotation_deg) else None  # sensor axes to body
+        self._si = imu.message == "HIGHRES_IMU"
+        self._limits = imu.accel_limit, imu.gyro_limit
+        self._stamp_us = 1 if imu.message in _IMU_STAMP else 1000  # microseconds in a unit of the stamp
+
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        decoder = self._decoder
+        if self._si and fields[8] != self._imu.instance:
+            decoder.counts["other instances"] += 1
+            return []
+        payload = self._payload(fields)
+        return [decoder.event(self._name, decoder.stamp(fields[0] * self._stamp_us), t_receive_ns, payload)]
+
+    def _payload(self, fields: tuple[Any, ...]) -> ImuSample | Invalid:
+        force, rate = fields[1:4], fields[4:7]
+        if not self._si:
+            force = (force[0] * MILLI_G, force[1] * MILLI_G, force[2] * MILLI_G)
+            rate = (rate[0] / 1e3, rate[1] / 1e3, rate[2] / 1e3)
+        elif fields[7] & ACCEL_AND_GYRO != ACCEL_AND_GYRO:
+            return Invalid("not updated")
+        accel_limit, gyro_limit = self._limits
+        calm, slow = _within(force, accel_limit), _within(rate, gyro_limit)
+        if not (calm and slow):
+            finite = math.isfinite(sum(force) + sum(rate))
+            return Invalid(("beyond gyro_limit" if calm else "beyond accel_limit") if finite else "not finite")
+        if self._mat_bs is None:
+            return ImuSample(force, rate)
+        return ImuSample(_turn(self._mat_bs, force), _turn(self._mat_bs, rate))
+
+
+class GnssHandler:
+    """One [gnss.NAME]: fields to GnssPosition and GnssVelocity."""
+
+    def __init__(self, decoder: Decoder, name: str, gnss: Gnss) -> None:
+        self._decoder, self._gnss = decoder, gnss
+        self._position, self._velocity = f"{name}.position", f"{name}.velocity"
+
+    def take(self, fields: tuple[int, ...], t_receive_ns: int) -> list[Received]:
+        time_us, fix_type, lat, lon, alt, vel, cog, alt_ellipsoid, h_acc, v_acc, vel_acc = fields
+        position: AnyPayload
+        velocity: AnyPayload
+        if fix_type < self._gnss.minimum_fix_type:
+            position = velocity = Invalid("no fix")
+        elif lat == 0 and lon == 0:
+            position = velocity = Invalid("no position")
+        elif abs(lat) > 900_000_000 or abs(lon) > 1_800_000_000:
+            position = velocity = Invalid("not on earth")
+        else:
+            height = (alt_ellipsoid or alt) / 1e3
+            latitude, longitude = math.radians(lat / 1e7), math.radians(lon / 1e7)
+            position = GnssPosition(latitude, longitude, height, _known(h_acc), _known(v_acc))
+            speed, course = vel / 1e2, math.radians(cog / 1e2)
+            velocity = GnssVelocity(speed * math.cos(course), speed * math.sin(course), None, _known(vel_acc))
+        decoder = self._decoder
+        stamp = decoder.stamp(time_us) if self._gnss.stamp == "sensor" else ("", None)
+        events = [decoder.event(self._position, stamp, t_receive_ns, position)]
+        if self._gnss.use_velocity and UNKNOWN_U16 not in (vel, cog):
+            events.append(decoder.event(self._velocity, stamp, t_receive_ns, velocity))
+        return events
+
+
+@dataclass(slots=True)
+class _Reading:
+    clock: str
+    raw_ns: int  # the message's stamp
+    t_ns: int  # that stamp, carried on by receipts where it stood still
+    t_receive_ns: int
+    distance: float  # m
+
+
+class WheelHandler:
+    """One [wheel.NAME] of WHEEL_DISTANCE: the mean speed between two messages, stamped at the middle between them.
+
+    An encoder's stamp may be that of its last pulse (ArduPilot), and so stand still with the wheel: then receipts tell how
+    much time has passed. The first message, and one that repeats the one before at once, give no event.
+    """
+
+    def __init__(self, decoder: Decoder, name: str, wheel: Wheel, config: Config) -> None:
+        self._decoder, self._name, self._wheel = decoder, name, wheel
+        self._fastest = config.filter.v_max_mps
+        self._last: _Reading | None = None
+
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        time_us, count, *distances = fields
+        clock, raw_ns = self._decoder.stamp(time_us)
+        index = self._wheel.index
+        if index is None or index >= count or raw_ns is None or not math.isfinite(distances[index]):
+            reason = "no stamp" if raw_ns is None else "no such wheel" if index is None or index >= count else "not finite"
+            return [self._decoder.event(self._name, (clock, raw_ns), t_receive_ns, Invalid(reason))]
+        last = self._last
+        t_ns = raw_ns
+        if last is not None and (clock, raw_ns) == (last.clock, last.raw_ns):
+            t_ns = last.t_ns + t_receive_ns - last.t_receive_ns
+        reading = _Reading(clock, raw_ns, t_ns, t_receive_ns, distances[index])
+        if last is None or last.clock != clock:
+            self._last = reading
+            return []
+        interval_ns = t_ns - last.t_ns
+        if abs(interval_ns) < SHORTEST_NS:
+            return []
+        self._last = reading
+        middle_ns = t_ns if interval_ns < 0 else last.t_ns + interval_ns // 2
+        payload = self._payload(last.distance, reading.distance, interval_ns)
+        return [self._decoder.event(self._name, (clock, middle_ns), t_receive_ns, payload)]
+
+    def _payload(self, before: float, after: float, interval_ns: int) -> WheelSpeed | Invalid:
+        wheel = self._wheel
+        if interval_ns < 0:
+            return Invalid("clock went back")
+        if interval_ns > LONGEST_NS:
+            return Invalid("gap")
+        seconds = interval_ns / SECOND
+        speed = (after - before) * wheel.scale / seconds
+        if (after == 0.0 and abs(before) > RESET_M) or (wheel.unsigned and speed * wheel.scale < 0):
+            return Invalid("counter reset")
+        if abs(speed) > self._fastest:
+            return Invalid("counter jumped")
+        quantum = wheel.quantum_m * abs(wheel.scale)
+        return WheelSpeed(speed, quantum / math.sqrt(6) / seconds)  # two readings, each with quantum^2 / 12
+
+
+class PressureHandler:
+    """One [barometer.NAME]: fields to Pressure."""
+
+    def __init__(self, decoder: Decoder, name: str, _barometer: Barometer) -> None:
+        self._decoder, self._name = decoder, name
+
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        boot_ms, hectopascal, centi_celsius = fields
+        absolute, temperature = hectopascal * PASCAL, centi_celsius / 100 + FREEZING
+        payload: AnyPayload = Pressure(absolute, temperature)
+        if not LEAST_PRESSURE <= absolute <= MOST_PRESSURE:
+            payload = Invalid("impossible pressure" if math.isfinite(absolute) else "not finite")
+        elif not COLDEST <= temperature <= HOTTEST:
+            payload = Invalid("impossible temperature")
+        return [self._decoder.event(self._name, self._decoder.stamp(boot_ms * 1000), t_receive_ns, payload)]
+
+
+def _known(thousandths: int) -> float | None:
+    """An accuracy of the extension fields, mm or mm/s: 0 is unknown."""
+    return thousandths / 1e3 if thousandths else None
+
+
+def _within(vector: Vector3, limit: float) -> bool:
+    """Is every component finite, and at most `limit` in size?"""
+    x, y, z = vector
+    return -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit
+
+
+def _rotation(angles_deg: Vector3) -> tuple[Vector3, Vector3, Vector3]:
+    """Rows of Rz(yaw) Ry(pitch) Rx(roll): it takes a vector in the sensor's axes to the body's."""
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in map(math.radians, angles_deg))
+    return (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+
+
+def _turn(rows: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
+    x, y, z = vector
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z

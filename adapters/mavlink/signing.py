@@ -1,0 +1,119 @@
+"""MAVLink 2 signing: one key, frames signed and frames checked, and a timestamp that never falls, over restarts either.
+
+Timestamps count 10 us since 2015. What is on disk is ahead of what was sent: it is written anew, a minute ahead, before
+it is reached. So a start after a crash, or with a wall clock that was set back, begins beyond everything sent before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond_adapters.mavlink.decoder import CHECKSUM, HEADER_2, MAGIC_2, SIGNED
+
+KEY_SIZE = 32  # bytes
+SIGNATURE_SIZE, DIGEST_SIZE = 13, 6  # bytes: link, timestamp (6), digest (6)
+EPOCH_NS = 1_420_070_400 * 10**9  # 2015
+TICK_NS = 10_000
+MINUTE = 60 * 10**9 // TICK_NS  # in timestamps
+LONGEST_FILE = 100  # characters of a timestamp file
+
+
+class Signing:
+    """The signing of one link. Raises ConfigError where the key or the timestamp cannot be read."""
+
+    def __init__(self, config: Config, link: str) -> None:
+        settings = config.mavlink[link]
+        assert settings.signing_key_file is not None and settings.signing_timestamp_file is not None
+        self._key = _read_key(config.path(settings.signing_key_file), f"mavlink.{link}.signing_key_file")
+        self._file = config.path(settings.signing_timestamp_file)
+        self._last = self._kept = _read_timestamp(self._file, f"mavlink.{link}.signing_timestamp_file")
+        self._accept_unsigned = settings.accept_unsigned
+        self._streams: dict[tuple[int, int, int], int] = {}  # by link id, system and component: the latest timestamp
+        self.counts = {"unsigned": 0, "wrongly signed": 0, "timestamp not kept": 0}
+
+    def prepare(self, voice: Any) -> None:
+        """Make a pymavlink MAVLink sign the next message it packs."""
+        self._last = max(self._last + 1, _now())
+        if self._last > self._kept:
+            self._keep(self._last + MINUTE)
+        voice.signing.secret_key = self._key
+        voice.signing.sign_outgoing = True
+        voice.signing.timestamp = self._last
+
+    def accepts(self, frame: bytes) -> bool:
+        """Is a frame signed with the key, and newer than those before it, or may it be unsigned? If not, it is counted."""
+        if frame[0] != MAGIC_2 or not frame[2] & SIGNED:
+            self.counts["unsigned"] += not self._accept_unsigned
+            return self._accept_unsigned
+        good = self._good(frame)
+        self.counts["wrongly signed"] += not good
+        return good
+
+    def _good(self, frame: bytes) -> bool:
+        end = HEADER_2 + frame[1] + CHECKSUM
+        signature = frame[end : end + SIGNATURE_SIZE]
+        digest = hashlib.sha256(self._key + frame[:-DIGEST_SIZE]).digest()[:DIGEST_SIZE]
+        if not hmac.compare_digest(digest, signature[-DIGEST_SIZE:]):
+            return False
+        timestamp = int.from_bytes(signature[1:-DIGEST_SIZE], "little")
+        stream = (signature[0], frame[5], frame[6])
+        last = self._streams.get(stream)
+        if timestamp <= (max(self._last, _now()) - MINUTE if last is None else last):
+            return False
+        self._streams[stream] = timestamp
+        return True
+
+    def _keep(self, timestamp: int) -> None:
+        """Write the timestamp that a restart begins from; the old one or the new one stands on disk, nothing between."""
+        new = self._file.with_name(self._file.name + ".new")
+        try:
+            with new.open("w", encoding="ascii") as file:
+                file.write(f"{timestamp}\n")
+                file.flush()
+                os.fsync(file.fileno())
+            new.replace(self._file)
+        except OSError:
+            self.counts["timestamp not kept"] += 1  # the disk is full or read-only: what is sent must go on
+        self._kept = timestamp
+
+
+def _now() -> int:
+    return (time.time_ns() - EPOCH_NS) // TICK_NS
+
+
+def _read_key(path: Path, key: str) -> bytes:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{key}: {path}: cannot be read: {error.strerror}") from error
+    if len(content) == KEY_SIZE:
+        return content
+    try:
+        secret = bytes.fromhex(content.decode("ascii"))
+    except ValueError:
+        secret = b""
+    if len(secret) != KEY_SIZE:
+        raise ConfigError(f"{key}: {path}: {KEY_SIZE} bytes, or {2 * KEY_SIZE} hex digits, are wanted")
+    return secret
+
+
+def _read_timestamp(path: Path, key: str) -> int:
+    """The timestamp kept; 0 where there is no file yet."""
+    if not path.parent.is_dir():
+        raise ConfigError(f"{key}: no such folder: {path.parent}")
+    try:
+        text = path.read_text(encoding="ascii")[:LONGEST_FILE]
+    except FileNotFoundError:
+        return 0
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{key}: {path}: cannot be read: {error}") from error
+    if not text.strip().isdecimal():
+        raise ConfigError(f"{key}: {path}: holds no timestamp; remove it to begin anew")
+    return int(text)

@@ -1,0 +1,1 @@
+"""Zenoh: sessions, the publishing output, answers to queries."""

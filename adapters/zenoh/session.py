@@ -1,0 +1,175 @@
+"""Zenoh: a session that keeps to itself unless told otherwise, and the publishers of all messages.
+
+A session hears and speaks on loopback only, by default: no multicast scouting, no gossip, no listener on other
+interfaces. Publishing hardly waits. Streams (state, settled, innovations) lose samples when a reader cannot keep up. What is
+told seldom (health, events, info, config) is kept here: readers that find one missing, or come late, fetch it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import cast
+
+import zenoh
+import zenoh.ext
+
+from fusiond.config.schema import Encoding
+from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.messages.schedule import key as key_of
+from fusiond.messages.types import MESSAGES, InnovationMessage, Message, encode
+
+STREAMS = ("state", "settled", "innovations")
+PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
+KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
+RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting: Zenoh's own is 1 to 4 s
+QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
+PATIENCE_US = 1000  # with which a sample waits for room there, as Zenoh has it
+TELL_LAST_S = 1.0  # a reader hears within this that it missed the last one
+WAIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+KIND = {message: kind for kind, message in MESSAGES.items()}
+
+CONTENT_TYPES: dict[Encoding, str] = {"json": "application/json", "msgpack": "application/msgpack"}
+
+
+class PublishError(Exception):
+    """Zenoh cannot be set up or used; the message says what was asked and why it failed."""
+
+
+def state_key(vehicle: str) -> str:
+    """Where the state of a vehicle is published."""
+    return key_of(vehicle, "state")
+
+
+def message_key(message: Message, vehicle: str) -> str:
+    """Where a message is published."""
+    return key_of(vehicle, KIND[type(message)], message.source if isinstance(message, InnovationMessage) else "")
+
+
+def alive_key(vehicle: str) -> str:
+    """The liveliness token of a vehicle; `@` hides it from subscribers to `**`."""
+    return f"fusiond/{vehicle}/@alive/state"
+
+
+def open_session(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Session:
+    """A session as configured; close it (it is a context manager) after its publishers. Raises PublishError.
+
+    Publishing waits for a reader whose queue is full PATIENCE_US, before it drops the sample; not at all unless `patient`.
+    """
+    config = session_config(section, directory, patient=patient)
+    what = f"zenoh: cannot open a {section.mode}, listen {section.listen}, connect {section.connect}"
+    with _explained(what):
+        return zenoh.open(config)
+
+
+def session_config(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Config:
+    """Zenoh's configuration: its own file first (relative to `directory`), then the section. Raises PublishError.
+
+    A key of the section that is left at its default yields to the file, where the file says other than Zenoh's default.
+    """
+    config = _from_file(Path(directory) / section.config_file) if section.config_file else zenoh.Config()
+    untouched, default = zenoh.Config(), ZenohSection()
+    for key, value, usual in (
+        ("mode", section.mode, default.mode),
+        ("listen/endpoints", section.listen, default.listen),
+        ("connect/endpoints", section.connect, default.connect),
+        ("scouting/multicast/enabled", section.multicast_scouting, default.multicast_scouting),
+        ("scouting/gossip/enabled", False, False),
+        ("connect/retry", RETRY, RETRY),
+        ("transport/link/tx/queue/size/real_time", QUEUED, QUEUED),
+        ("transport/link/tx/queue/size/data", QUEUED, QUEUED),
+        (WAIT, PATIENCE_US if patient else 0, PATIENCE_US),
+    ):
+        if value != usual or config.get_json(key) == untouched.get_json(key):
+            with _explained(f"zenoh: {key} cannot be {value!r}"):
+                config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _from_file(path: Path) -> zenoh.Config:
+    with _explained(f"zenoh: config_file {path}"):
+        return zenoh.Config.from_file(path)
+
+
+@contextmanager
+def _explained(what: str) -> Iterator[None]:
+    """Turn Zenoh's error into ours: what was asked, and the reason without the places in Zenoh's own source."""
+    try:
+        yield
+    except zenoh.ZError as error:
+        reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error)).strip()
+        raise PublishError(f"{what}: {reason}") from error
+
+
+class ZenohPublisher:
+    """Publishes messages of all kinds, and a liveliness token that tells readers as long as it does.
+
+    A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared.
+    """
+
+    def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding) -> None:
+        self.vehicle = vehicle
+        self._session, self._encoding = session, encoding
+        self._publishers: dict[str, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}  # by key
+        self._closed = False
+        with _explained(f"zenoh: cannot publish on {key_of(vehicle, '**')}"), ExitStack() as declared:
+            for kind in MESSAGES:
+                if kind != "innovations":  # each source's is declared when it comes
+                    self._declare(key_of(vehicle, kind), kind, declared)
+            declared.enter_context(session.liveliness().declare_token(alive_key(vehicle)))
+            self._declared = declared.pop_all()
+
+    def _declare(self, where: str, kind: str, declared: ExitStack) -> None:
+        encoding, drop = zenoh.Encoding(CONTENT_TYPES[self._encoding]), zenoh.CongestionControl.DROP
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
+        if kind in STREAMS:
+            publisher = self._session.declare_publisher(
+                where, encoding=encoding, congestion_control=drop, priority=PRIORITY[kind], express=kind != "innovations"
+            )
+        else:
+            publisher = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                where,
+                encoding=encoding,
+                congestion_control=drop,
+                cache=zenoh.ext.CacheConfig(KEPT[kind]),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=TELL_LAST_S),
+                publisher_detection=True,
+            )
+        declared.enter_context(publisher)
+        self._publishers[where] = publisher
+
+    @property
+    def matched(self) -> bool:
+        """Whether anyone subscribes to the state."""
+        publisher = cast(zenoh.Publisher, self._publishers[state_key(self.vehicle)])
+        status = cast(zenoh.MatchingStatus, publisher.matching_status)  # its stub says bool, which it is not
+        return bool(status.matching)
+
+    def publish(self, message: Message) -> None:
+        """Send a message to whoever subscribes. Raises PublishError where the session is closed."""
+        where = message_key(message, self.vehicle)
+        payload = encode(message, self._encoding)
+        if self._closed:
+            raise PublishError(f"zenoh: cannot publish on {where}: closed")
+        with _explained(f"zenoh: cannot publish on {where}"):
+            if where not in self._publishers:
+                self._declare(where, KIND[type(message)], self._declared)
+            self._publishers[where].put(payload)
+
+    def close(self) -> None:
+        """Withdraw the token, then the publishers. Closing twice does nothing."""
+        self._closed = True
+        self._declared.close()
+
+    def __enter__(self) -> ZenohPublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

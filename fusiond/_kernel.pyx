@@ -1,7 +1,0 @@
-# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""The compiled hot loop (_kernel.pxi) for the ordinary state: see there."""
-
-cdef enum:
-    n = 18  # error states
-
-include "_kernel.pxi"

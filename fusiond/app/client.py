@@ -1,0 +1,174 @@
+"""For those who read fusiond: subscribe to a vehicle's messages over Zenoh, with their types, and ask for what was.
+
+    from fusiond.app.client import Client
+    from fusiond.messages.types import StateMessage
+
+    with Client("tcp/127.0.0.1:7447", "rover") as client:
+        for message in client.stream(StateMessage, timeout_s=2.0):
+            print(message.t_ns, message.mode, message.state and message.state.lat_deg)
+
+Callbacks run in a thread of Zenoh's; what is slow belongs elsewhere. All else may be called from any thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import msgspec
+import zenoh
+import zenoh.ext
+
+from fusiond.config.schema import Encoding
+from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.messages.schedule import key
+from fusiond.messages.types import (
+    ConfigMessage,
+    HealthMessage,
+    InfoMessage,
+    InnovationMessage,
+    Message,
+    StateMessage,
+    decode,
+)
+from fusiond.ports.outputs import Outbox
+from fusiond_adapters.zenoh.session import CONTENT_TYPES, KIND, STREAMS, PublishError, alive_key, open_session
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+STREAM_MESSAGES = 1024  # kept for a slow reader of a stream; of more the oldest are dropped
+ENCODINGS: dict[str, Encoding] = {content_type: encoding for encoding, content_type in CONTENT_TYPES.items()}
+
+AnyMessage = TypeVar("AnyMessage", bound=Message)
+
+
+class ClientError(Exception):
+    """fusiond cannot be reached, or does not answer as asked; the message says why."""
+
+
+class Client:
+    """A connection to the fusiond of one vehicle (or of all: `vehicle="*"`), directly or through a router.
+
+    `config_file` is Zenoh's own configuration, for TLS and the like. Raises ClientError where nobody can be reached.
+    """
+
+    def __init__(
+        self,
+        endpoint: str = DEFAULT_ENDPOINT,
+        vehicle: str = "vehicle",
+        *,
+        config_file: str | Path | None = None,
+        timeout_s: float = 5.0,
+    ) -> None:
+        self.vehicle = vehicle
+        self.undecodable = 0  # samples that were no such message
+        self._timeout_s = timeout_s
+        file = None if config_file is None else str(Path(config_file).absolute())
+        section = ZenohSection(mode="client", listen=[], connect=[endpoint], config_file=file)
+        self._opened = ExitStack()
+        try:
+            self._session = self._opened.enter_context(open_session(section))
+        except PublishError as error:
+            raise ClientError(str(error)) from error
+
+    # --- As it comes
+
+    @contextmanager
+    def subscribed(self, kind: type[AnyMessage], callback: Callable[[AnyMessage], None]) -> Iterator[None]:
+        """Inside the block, `callback` gets every message of a kind.
+
+        Health, events, info and config come with the latest one at once, and what was missed is fetched again; a state,
+        settled state or innovation that a slow network loses stays lost.
+        """
+        name = KIND[kind]
+        where = key(self.vehicle, name, "*" if kind is InnovationMessage else "")
+
+        def receive(sample: zenoh.Sample) -> None:
+            message = self._decoded(sample, kind)
+            if message is not None:
+                callback(message)
+
+        subscriber: Any
+        if name in STREAMS:
+            subscriber = self._session.declare_subscriber(where, receive)
+        else:
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                self._session,
+                where,
+                receive,
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+                recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            )
+        with subscriber:
+            yield
+
+    def stream(self, kind: type[AnyMessage], timeout_s: float) -> Iterator[AnyMessage]:
+        """The messages of a kind as they come. Raises TimeoutError when none has come for so long."""
+        outbox = Outbox(STREAM_MESSAGES, (kind,))
+        with self.subscribed(kind, outbox.put):
+            while messages := outbox.take(timeout_s):
+                yield from cast(list[AnyMessage], messages)  # the outbox lets in no other kind
+        raise TimeoutError(f"no {KIND[kind]} of {self.vehicle} for {timeout_s:g} s")
+
+    # --- On demand
+
+    def latest(self, kind: type[AnyMessage]) -> AnyMessage:
+        """The latest message of a kind. Raises ClientError."""
+        return self._ask(kind, "")
+
+    def state_at(self, t_ns: int) -> StateMessage:
+        """The state published nearest to an instant within the horizon. Raises ClientError."""
+        return self._ask(StateMessage, f"?t_ns={t_ns}")
+
+    def health(self) -> HealthMessage:
+        """How everything is. Raises ClientError."""
+        return self.latest(HealthMessage)
+
+    def info(self) -> InfoMessage:
+        """What is running there. Raises ClientError."""
+        return self.latest(InfoMessage)
+
+    def config(self) -> ConfigMessage:
+        """The configuration in force there. Raises ClientError."""
+        return self.latest(ConfigMessage)
+
+    def alive(self) -> frozenset[str]:
+        """The vehicles whose fusiond is there, of those asked for."""
+        replies = self._session.liveliness().get(alive_key(self.vehicle), timeout=self._timeout_s)
+        return frozenset(str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None)
+
+    def _ask(self, kind: type[AnyMessage], parameters: str) -> AnyMessage:
+        where = key(self.vehicle, KIND[kind], "*" if kind is InnovationMessage else "")
+        refusal = "nobody answers"
+        for reply in self._session.get(where + parameters, timeout=self._timeout_s):
+            if reply.ok is not None:
+                message = self._decoded(reply.ok, kind)
+                if message is not None:
+                    return message
+                refusal = f"the answer is no {kind.__name__}"
+            elif reply.err is not None:
+                refusal = reply.err.payload.to_string()
+        raise ClientError(f"{where}: {refusal}")
+
+    def _decoded(self, sample: zenoh.Sample, kind: type[AnyMessage]) -> AnyMessage | None:
+        encoding = ENCODINGS.get(str(sample.encoding))
+        if encoding is not None:
+            try:
+                return decode(sample.payload.to_bytes(), kind, encoding)
+            except msgspec.DecodeError:
+                pass  # counted below, with what has another content type
+        self.undecodable += 1
+        return None
+
+    # --- Its end
+
+    def close(self) -> None:
+        """End the connection. Closing twice does nothing."""
+        self._opened.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

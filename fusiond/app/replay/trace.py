@@ -1,0 +1,95 @@
+"""What a picture of a replay needs: samples of the published states and the GNSS fixes, thinned to a bounded number."""
+
+from __future__ import annotations
+
+import math
+from typing import Generic, NamedTuple, TypeVar
+
+from fusiond.app.replay.comparison import Errors, displacement
+from fusiond.estimator.fusion import Receipt
+from fusiond.estimator.solution import Mode
+from fusiond.events import GnssPosition
+from fusiond.filter.step import Outcome
+from fusiond.messages.types import StateMessage
+
+CAPACITY = 6000  # samples kept of each kind: more than a picture has pixels across
+
+Item = TypeVar("Item")
+
+
+class Thinned(Generic[Item]):
+    """A list that keeps every n-th item, n doubling whenever it is full."""
+
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        self.items: list[Item] = []
+        self._capacity, self._every, self._offered = capacity, 1, 0
+
+    def add(self, item: Item) -> None:
+        if self._offered % self._every == 0:
+            if len(self.items) == self._capacity:
+                del self.items[1::2]
+                self._every *= 2
+            if self._offered % self._every == 0:
+                self.items.append(item)
+        self._offered += 1
+
+
+class TickSample(NamedTuple):
+    """One publication; places are in metres north and east of the trace's origin, the first place of all."""
+
+    t_ns: int
+    north_m: float
+    east_m: float
+    yaw_deg: float
+    sigma_north_m: float
+    sigma_east_m: float
+    sigma_yaw_deg: float
+    reckoned: bool  # dead reckoning
+    errors: Errors | None
+    true_north_m: float  # not a number without errors
+    true_east_m: float
+
+
+class FixSample(NamedTuple):
+    """One GNSS position as received."""
+
+    t_ns: int  # aligned: the instant it tells of
+    north_m: float
+    east_m: float
+
+
+class Trace:
+    """Gathers the samples of one replay."""
+
+    def __init__(self) -> None:
+        self.ticks: Thinned[TickSample] = Thinned()
+        self.fixes: Thinned[FixSample] = Thinned()
+        self.rejected: Thinned[FixSample] = Thinned()  # apart, so that thinning loses none of a few
+        self._origin: tuple[float, float, float] | None = None  # lat, lon [deg], height [m]
+
+    def add_tick(self, message: StateMessage, errors: Errors | None) -> None:
+        state = message.state
+        if state is None:
+            return
+        north, east = self._place(state.lat_deg, state.lon_deg, state.height_m)
+        true = (math.nan, math.nan)
+        if errors:
+            true = self._place(errors.true.lat_deg, errors.true.lon_deg, errors.true.height_m)
+        sigma_north, sigma_east, _ = state.sigma_position_ned_m
+        reckoned = message.mode is Mode.DEAD_RECKONING
+        sigmas = (sigma_north, sigma_east, state.sigma_yaw_deg)
+        self.ticks.add(TickSample(message.t_ns, north, east, state.yaw_deg, *sigmas, reckoned, errors, *true))
+
+    def add_receipt(self, receipt: Receipt) -> None:
+        fix = receipt.measurement.payload
+        if not isinstance(fix, GnssPosition) or receipt.refusal is Outcome.INVALID:
+            return
+        north, east = self._place(math.degrees(fix.latitude), math.degrees(fix.longitude), fix.height)
+        kept = self.rejected if receipt.outcome is Outcome.REJECTED else self.fixes
+        kept.add(FixSample(receipt.measurement.t_ns, north, east))
+
+    def _place(self, lat_deg: float, lon_deg: float, height_m: float) -> tuple[float, float]:
+        if self._origin is None:
+            self._origin = lat_deg, lon_deg, height_m
+        lat, lon, height = self._origin
+        return displacement(lat_deg, lon_deg, (lat, lon), height)

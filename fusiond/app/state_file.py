@@ -1,0 +1,89 @@
+"""The file of the stored state: read at the start, written in one piece or not at all, its failures counted."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+from fusiond.config.schema import Config
+from fusiond.filter.hot_start import WORDS, Verdict
+from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, to_text
+from fusiond.messages.types import OutputHealth
+
+MOST_BYTES = 1_000_000  # a larger file is none of ours
+
+log = logging.getLogger("fusiond")
+
+
+def read_state(path: Path) -> StoredState | None:
+    """What the file holds; None where there is none yet. Raises StoredStateError."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise StoredStateError(f"cannot be read: {error.strerror}") from error
+    if len(text) > MOST_BYTES:
+        raise StoredStateError("torn or altered: it is too large")
+    return from_text(text)
+
+
+class StateFile:
+    """Reads what the last run left, and keeps the newest state on disk: whoever reads the file finds the old one or the new
+    one, whole."""
+
+    def __init__(self, path: Path, config: Config, now_ns: int) -> None:
+        self.stored: StoredState | None = None  # what the last run left, if it is of use
+        self.written = self.lost = 0
+        self.error: str | None = None  # the last one, while it lasts
+        self._path = path
+        self._cold = "there is none yet"
+        self._told = Verdict.NONE
+        try:
+            stored = read_state(path)
+            if stored is not None:
+                check(stored, config, now_ns)
+                self.stored = stored
+        except StoredStateError as error:
+            self._cold = str(error)
+            log.warning("stored state ignored: %s: %s", path, error)
+
+    def health(self, verdict: Verdict) -> OutputHealth:
+        """Writes and failures, and what became of the stored state; the log has one line when that is decided."""
+        about = WORDS[verdict] if self.stored else f"ignored: {self._cold}"
+        if verdict is not self._told:
+            self._told = verdict
+            log.info("stored state: %s", about)
+        notes = {"hot_start": about} | ({"error": self.error} if self.error else {})
+        return OutputHealth(offered=self.written + self.lost, dropped=self.lost, counts={}, notes=notes)
+
+    def write(self, stored: StoredState) -> None:
+        """Replace the file, and see to it that this lasts. A failure is counted; the file then stays as it was."""
+        try:
+            self._replace(to_text(stored))
+        except OSError as error:
+            self.lost += 1
+            self.error = error.strerror or str(error)
+        else:
+            self.written += 1
+            self.error = None
+
+    def _replace(self, text: bytes) -> None:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = self._path.with_name(self._path.name + ".new")
+        try:
+            with fresh.open("wb") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self._path)
+        except OSError:
+            fresh.unlink(missing_ok=True)
+            raise
+        folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)  # the name, too, outlasts a power cut
+        finally:
+            os.close(folder)

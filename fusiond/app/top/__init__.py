@@ -1,0 +1,1 @@
+"""`fusiond top`: a running vehicle in the terminal."""

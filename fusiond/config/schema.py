@@ -1,0 +1,371 @@
+"""The tables of the configuration: keys, units, defaults and bounds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta, field
+
+from fusiond.config.toml import Name, Section
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Seconds = Annotated[float, Meta(gt=0, le=1_000_000)]
+Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
+Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
+Vector = tuple[float, float, float]
+Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
+Encoding = Literal["json", "msgpack"]
+Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
+PressureMessage = Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"]
+Checksum = Literal["toyota", "honda", "hyundai", "tesla"]
+ImuMessage = Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"]
+
+
+class Vehicle(Section, frozen=True, kw_only=True):
+    """[vehicle]"""
+
+    name: Name = "vehicle"  # names the vehicle in every published key
+    geoid_m: float = 0.0  # geoid above the ellipsoid here, taken off heights for MAVLink, which counts from the sea
+
+
+class Filter(Section, frozen=True, kw_only=True):
+    """[filter]: the estimator, its memory and how it starts."""
+
+    horizon_s: Seconds = 1.0  # how late a measurement may be and still be put where it belongs
+    snapshot_interval_s: Span = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
+    imu_gap_s: Seconds = 0.2  # an IMU silent for longer is bridged by coasting
+    restart_gap_s: Seconds = 30.0  # after a hole in the data of this length the filter aligns anew
+    gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
+    gnss_reset_s: Seconds = 30.0  # GNSS that was rejected for this long, off alike all the time, is believed again
+    gnss_return_s: Seconds = 3.0  # the same where no fix was fused for 10 s before
+    v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
+    heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # heading at the first start, clockwise from north
+    heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
+    heading_spread_deg: Annotated[float, Meta(gt=0, le=30)] = 8.0  # headings this close together are chosen between no more
+    course_speed_mps: Positive = 8.0  # above this GNSS speed, at which it never reverses, its course is the start heading
+    level_sigma_deg: Positive = 3.0  # sigma of roll and pitch after leveling on the accelerometer
+    position_timeout_s: Seconds = 2.0  # without a position fix for this long: dead reckoning
+    lost_sigma_m: Positive = 200.0  # horizontal position sigma beyond which the state is called lost
+    wheel_scale_sigma: NotNegative = 0.01  # first sigma of a wheel scale (1 = 100 %); 0 freezes it at zero
+    wheel_scale_by: Literal["vehicle", "axle", "wheel"] = "vehicle"  # one scale for all wheels, or for each axle or wheel
+    wheel_scale_walk: NotNegative = 1e-5  # its random walk [1/sqrt(s)]
+    mount_sigma_deg: NotNegative = 1.0  # first sigma of the IMU's pitch and yaw against the vehicle; 0 freezes them
+    mount_walk_deg: NotNegative = 1e-3  # its random walk [deg/sqrt(s)]
+
+
+class Motion(Section, frozen=True, kw_only=True):
+    """[motion]: what a wheeled vehicle cannot do, used as measurements."""
+
+    non_holonomic: bool = True  # no sideways or vertical speed at the point below
+    point_m: Vector = (0.0, 0.0, 0.0)  # where it holds, from the IMU: the middle of the unsteered axle
+    lateral_sigma_mps: Positive = 0.2  # how far the point may slip sideways: sigma of that constraint
+    vertical_sigma_mps: Positive = 0.3  # likewise up and down: suspension
+    interval_s: Seconds = 0.1  # spacing of constraint, zero velocity and zero rotation updates
+    minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint rests below this speed
+    standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
+    still_wheel_mps: Positive = 0.1  # every wheel at or below this; so fast it may creep unseen
+    still_gyro_deg_s: Positive = 0.6  # and the gyro's scatter below this
+    still_accel_mps2: Positive = 0.25  # and the accelerometer's scatter below this
+    still_after_s: Seconds = 0.5  # for this long
+    zero_velocity_sigma_mps: Positive = 0.02  # sigma of the velocity at standstill, per axis
+    zero_rotation_sigma_deg_s: Positive = 0.1  # sigma of the angular rate at standstill, per axis
+
+
+class Mavlink(Section, frozen=True, kw_only=True):
+    """[mavlink.NAME]: one MAVLink link; a .tlog given to replay stands for the first of them."""
+
+    connection: str = "udpin:127.0.0.1:14550"  # pymavlink connection string
+    baud: Annotated[int, Meta(gt=0)] = 115200  # for serial devices
+    dialect: Name = "common"  # pymavlink dialect, "common" or "ardupilotmega"
+    system: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this system id; 0: the first autopilot heard
+    component: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this component id; 0: every one
+    own_system: Annotated[int, Meta(ge=0, le=255)] = 0  # fusiond's own system id, live; 0: that of the autopilot
+    own_component: Annotated[int, Meta(ge=1, le=255)] = 191  # fusiond's own component id (191: onboard computer)
+    request: bool = True  # live: ask the autopilot for the messages needed, at the rates of [imu] and [gnss]
+    timesync: bool = True  # live: measure the autopilot's clock by TIMESYNC round trips
+    signing_key_file: str | None = None  # 32 bytes, or 64 hex digits: sign what is sent, take only what is signed so
+    signing_timestamp_file: str | None = None  # where the last signing timestamp is kept over restarts
+    accept_unsigned: bool = False  # with a key: take unsigned frames as well; wrongly signed ones never
+
+
+class Can(Section, frozen=True, kw_only=True):
+    """[can.NAME]: one CAN bus."""
+
+    dbc: list[str] = field(default_factory=list)  # DBC files, relative to this file
+    log_channel: str | None = None  # the bus's name in a log; default: NAME
+    interface: str | None = None  # python-can interface; default: python-can's own configuration
+    channel: str | None = None  # python-can channel; default: python-can's own configuration
+    config_context: str | None = None  # section of python-can's own configuration file
+    fd: bool = False  # CAN FD
+    bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], where the interface does not set it
+    delay_ms: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0  # how old a frame is when it is received
+    j1939: bool = False  # match 29-bit ids by PGN, of any priority and sender; always so where the DBC says J1939
+
+
+class Imu(Section, frozen=True, kw_only=True):
+    """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: ImuMessage = "HIGHRES_IMU"  # the message that carries it
+    instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
+    rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to ask the autopilot for, live
+    rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was true
+    accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
+    gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
+    accel_bias_sigma: NotNegative = 0.3  # first sigma of the accelerometer bias [m/s^2]
+    gyro_bias_sigma: NotNegative = 0.01  # first sigma of the gyro bias [rad/s]
+    accel_bias_walk: NotNegative = 1e-3  # accelerometer bias random walk [m/s^2/sqrt(s)]
+    gyro_bias_walk: NotNegative = 2e-5  # gyro bias random walk [rad/s/sqrt(s)]
+    accel_limit: Positive = 160.0  # a sample beyond this is invalid [m/s^2]
+    gyro_limit: Positive = 35.0  # a sample beyond this is invalid [rad/s]
+
+
+class Gnss(Section, frozen=True, kw_only=True):
+    """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"  # the message that carries it
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the position was true
+    velocity_delay_ms: Milliseconds = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
+    lever_arm_sigma_m: NotNegative = 0.0  # first sigma of the lever arm, per axis, which is then learnt; 0 freezes it
+    delay_sigma_ms: NotNegative = 0.0  # likewise, delay
+    velocity_delay_sigma_ms: NotNegative = 0.0  # likewise, velocity delay
+    stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's own stamp, use the receipt less delay_ms
+    position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and the least it is believed to be
+    height_sigma_m: Positive = 3.0  # likewise, vertical
+    velocity_sigma_mps: Positive = 0.2  # likewise, per axis
+    position_correlation_s: NotNegative = 0.0  # time over which position errors stay alike: weighs dense fixes down
+    velocity_correlation_s: NotNegative = 0.0  # likewise, velocity
+    use_velocity: bool = True  # fuse speed and course as well
+    outliers: Literal["gate", "mixture"] = "gate"  # leave them out, or weigh each fix by how likely it is one
+    outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, where outliers = "mixture"
+    noise_least: Positive = 1.0  # the sigmas are learnt from the innovations, down to this multiple of the given ones
+    noise_most: Positive = 3.0  # and up to this
+    group: Name | None = None  # receivers of one group share part of their error: atmosphere, multipath
+    shared_sigma_m: NotNegative = 0.0  # that part of the position's error
+    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # GPS_FIX_TYPE that a fix must have at least; 3: 3-D
+    interval_s: Positive = 0.2  # expected spacing of fixes
+
+
+class Barometer(Section, frozen=True, kw_only=True):
+    """[barometer.NAME]: a static pressure sensor, taken as a height with an unknown offset. At most one."""
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: PressureMessage = "SCALED_PRESSURE"  # the message that carries it
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # readings a second to ask the autopilot for, live
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true
+    sigma_m: Positive = 1.0  # noise of one reading, as a height: wind, draught, and what speed does to static pressure
+    correlation_s: NotNegative = 1.0  # time over which its errors stay alike
+    noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_m
+    noise_most: Positive = 3.0  # and up to this
+    offset_sigma_m: Positive = 100.0  # first sigma of what it reads too much, which is learnt: weather and geoid
+    offset_walk_m: NotNegative = 0.1  # its random walk [m/sqrt(s)]: weather, and air that is not the standard's
+
+
+class Wheel(Section, frozen=True, kw_only=True):
+    """[wheel.NAME]: one wheel; each is a source of its own. By CAN (bus, message, signal) or by MAVLink's WHEEL_DISTANCE
+    (link, index)."""
+
+    bus: Name | None = None  # the [can.BUS] it comes by
+    message: str | None = None  # message name in the DBC
+    signal: str | None = None  # signal name in the DBC
+    link: Name | None = None  # the [mavlink.LINK] whose WHEEL_DISTANCE it comes by, in place of bus, message and signal
+    index: Annotated[int, Meta(ge=0, le=15)] | None = None  # its place in WHEEL_DISTANCE, from 0
+    quantum_m: NotNegative = 0.0  # step of WHEEL_DISTANCE: adds quantum^2/6 over the interval's square to the variance
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # WHEEL_DISTANCE messages a second to ask for, live
+    unit: Unit = "km/h"  # of the decoded signal; rad/s and rpm need radius_m
+    radius_m: Positive | None = None  # rolling radius
+    scale: float = 1.0  # known factor on the signal; negative where it counts backwards
+    unsigned: bool = True  # the signal tells the amount only, not the direction
+    direction_signal: str | None = None  # a signal whose value reverse_value means driving backwards
+    reverse_value: int = 1  # what direction_signal reads when driving backwards
+    valid_signal: str | None = None  # a signal that must equal valid_value
+    valid_value: int = 0  # what valid_signal must read
+    counter_signal: str | None = None  # a rolling counter; a repeated value marks a stale frame
+    checksum: Checksum | None = None  # whose checksum the frame ends with
+    not_available_from: int | None = None  # raw values of the signal from here on mean error or not available
+    base_signal: str | None = None  # a signal in the same unit that is added: J1939's axle speed under a relative one
+    position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
+    steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
+    sigma_mps: Positive = 0.1  # white noise of one reading
+    noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_mps
+    noise_most: Positive = 3.0  # and up to this
+    group: Name | None = None  # wheels of one group share part of their error: tyres, one axle's slip
+    shared_sigma_mps: NotNegative = 0.0  # that part of it
+    least_mps: NotNegative = 0.1  # slower than this it reads 0, or anything
+    quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
+    correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)
+
+
+class Publish(Section, frozen=True, kw_only=True):
+    """[publish]"""
+
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
+    on_imu: bool = False  # each waits up to half a period for the next IMU sample, and is of its receipt
+    settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # of the state at the horizon, at most; 0: none
+    innovations: bool = True  # tell of every measurement how it was judged
+    encoding: Encoding = "json"  # "json" or "msgpack"
+
+
+class Zenoh(Section, frozen=True, kw_only=True):
+    """[zenoh]: where the state is published. Loopback and no scouting unless said otherwise."""
+
+    mode: Literal["peer", "client", "router"] = "peer"  # a client needs a router, a peer does not
+    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # endpoints to listen on
+    connect: list[str] = field(default_factory=list)  # endpoints to connect to
+    multicast_scouting: bool = False  # find and be found by others on the local network
+    config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
+
+
+class Live(Section, frozen=True, kw_only=True):
+    """[live]: how `fusiond run` treats its inputs."""
+
+    queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 1024  # of each input; when full it is thinned
+    reopen_max_s: Annotated[float, Meta(gt=0, le=600)] = 5.0  # longest pause before a lost input is opened again
+
+
+class Record(Section, frozen=True, kw_only=True):
+    """[record]: the black box of `fusiond run`: what was received, as .tlog and candump .log."""
+
+    folder: str | None = None  # such as "/var/lib/fusiond/box"; none: nothing is recorded
+    file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # a file that has grown to this is followed by another
+    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
+
+
+class State(Section, frozen=True, kw_only=True):
+    """[state]: the state that `fusiond run` keeps on disk, for a hot start."""
+
+    file: str | None = None  # such as "/var/lib/fusiond/state.json"; none: every start is a cold one
+    every_s: Annotated[float, Meta(ge=1, le=86400)] = 10.0  # it is written this often, and at the end
+    max_age_s: Annotated[float, Meta(gt=0, le=1e9)] = 604800.0  # one older than this is ignored; default: a week
+
+
+class Mcap(Section, frozen=True, kw_only=True):
+    """[mcap]: MCAP files of everything published, for Foxglove; needs the extra `mcap`."""
+
+    folder: str | None = None  # such as "/var/lib/fusiond/mcap"; none: nothing is written
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # states a second, at most; none: every one
+    file_mb: Annotated[float, Meta(ge=0.5, le=100_000)] = 64.0  # a file that has grown to about this is followed by another
+    total_mb: Annotated[float, Meta(ge=1, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
+
+
+class Foxglove(Section, frozen=True, kw_only=True):
+    """[foxglove]: a WebSocket server that Foxglove connects to; needs the extra `foxglove`."""
+
+    enabled: bool = False  # serve
+    host: str = "127.0.0.1"  # address to listen on; there is no access control
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8765  # TCP port; 0: any that is free
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = 20.0  # states a second, at most
+
+
+class Ros2(Section, frozen=True, kw_only=True):
+    """[ros2]: what ROS 2 nodes with rmw_zenoh can subscribe to, without ROS here; needs the extra `ros2`."""
+
+    enabled: bool = False  # publish
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID
+    namespace: Annotated[str, Meta(pattern=r"^(/|(/[A-Za-z_][A-Za-z0-9_]*)+)$")] = "/"  # of the node and its topics
+    node: Name = "fusiond"  # name of the node
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # states a second, at most
+    map_frame: Frame = "map"  # east-north-up at the origin; the pose in it jumps when the filter corrects itself
+    odom_frame: Frame = "odom"  # the pose in it drifts, but never jumps
+    base_frame: Frame = "base_link"  # the IMU's place, with axes forward-left-up
+    origin: Vector | None = None  # of the map frame: latitude, longitude [deg], height; none: the first position
+    tf: bool = True  # tell tf2 of map, odom and base_link; false where another node does
+    type_hashes: bool = True  # as in ROS 2 Iron and later; false for Humble, which has none
+    mode: Literal["client", "peer"] = "client"  # a client needs a router (rmw_zenohd), a peer does not
+    connect: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # Zenoh endpoints to connect to
+    listen: list[str] = field(default_factory=list)  # Zenoh endpoints to listen on, as a peer
+    config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
+
+
+class Prometheus(Section, frozen=True, kw_only=True):
+    """[prometheus]: metrics for Prometheus, over HTTP at /metrics; needs the extra `prometheus`."""
+
+    enabled: bool = False  # serve
+    host: str = "127.0.0.1"  # address to listen on; there is no access control
+    port: Annotated[int, Meta(ge=0, le=65535)] = 9464  # TCP port; 0: any that is free
+
+
+class Autopilot(Section, frozen=True, kw_only=True):
+    """[autopilot]: the state sent back to the autopilot as a source of its own estimator, live; off without a link."""
+
+    link: Name | None = None  # the [mavlink.LINK] of the autopilot; none: nothing is sent
+    kind: Literal["ardupilot", "px4"] = "ardupilot"  # whose rules the messages follow
+    message: Literal["odometry", "gps_input", "vision_position"] = "odometry"  # PX4 takes no gps_input
+    rate_hz: Annotated[float, Meta(ge=4, le=200)] = 30.0  # messages a second; at most publish.rate_hz
+    dead_reckoning: bool = True  # send while dead reckoning too, within the limits below
+    position_sigma_m: Positive = 5.0  # nothing is sent beyond this horizontal position sigma, north or east
+    velocity_sigma_mps: Positive = 1.0  # nor beyond this velocity sigma
+    yaw_sigma_deg: Positive = 15.0  # nor beyond this yaw sigma
+    age_ms: Positive = 500.0  # nor when the last IMU sample is older
+    set_origin: bool = False  # tell the autopilot where the local origin is, as long as it has none of its own
+    gps_id: Annotated[int, Meta(ge=0, le=1)] = 1  # which receiver gps_input stands for: 0 is the first, 1 the second
+
+
+class GroundStation(Section, frozen=True, kw_only=True):
+    """[ground_station]: telemetry, events and answers for a ground station, live; off without link and connection."""
+
+    link: Name | None = None  # send over this [mavlink.LINK], to be routed by the autopilot
+    connection: str | None = None  # or over a connection of its own, such as "udpout:192.168.1.10:14550"
+    baud: Annotated[int, Meta(gt=0)] = 115200  # of that connection, for serial devices
+    system: Annotated[int, Meta(ge=0, le=255)] = 0  # own system id on that connection; 0: that of the autopilot
+    component: Annotated[int, Meta(ge=1, le=255)] = 191  # own component id on that connection (191: onboard computer)
+    rate_hz: Annotated[float, Meta(ge=0.1, le=100)] = 4.0  # position and attitude messages a second
+    marker_system: Annotated[int, Meta(ge=0, le=255)] = 0  # system id of a vehicle that marks the state on the map; 0: none
+
+
+class Config(Section, frozen=True, kw_only=True):
+    """The whole file."""
+
+    vehicle: Vehicle = field(default_factory=Vehicle)
+    filter: Filter = field(default_factory=Filter)
+    motion: Motion = field(default_factory=Motion)
+    publish: Publish = field(default_factory=Publish)
+    zenoh: Zenoh = field(default_factory=Zenoh)
+    live: Live = field(default_factory=Live)
+    record: Record = field(default_factory=Record)
+    state: State = field(default_factory=State)
+    autopilot: Autopilot = field(default_factory=Autopilot)
+    ground_station: GroundStation = field(default_factory=GroundStation)
+    mcap: Mcap = field(default_factory=Mcap)
+    foxglove: Foxglove = field(default_factory=Foxglove)
+    prometheus: Prometheus = field(default_factory=Prometheus)
+    ros2: Ros2 = field(default_factory=Ros2)
+    mavlink: dict[Name, Mavlink] = field(default_factory=dict)
+    can: dict[Name, Can] = field(default_factory=dict)
+    imu: dict[Name, Imu] = field(default_factory=dict)
+    gnss: dict[Name, Gnss] = field(default_factory=dict)
+    wheel: dict[Name, Wheel] = field(default_factory=dict)
+    barometer: dict[Name, Barometer] = field(default_factory=dict)
+    directory: str = "."  # set on loading: where relative file names start
+
+    def path(self, name: str) -> Path:
+        """A file name of the configuration, resolved against its folder."""
+        return Path(self.directory) / name
+
+    def sources(self) -> tuple[str, ...]:
+        """Every source of measurements, in the order that breaks ties of time."""
+        gnss = [f"{name}.{kind}" for name in self.gnss for kind in ("position", "velocity")]
+        return tuple(sorted([*self.imu, *gnss, *self.wheel, *self.barometer]))
+
+
+MOST_SCALES = 4
+
+
+def wheel_groups(config: Config) -> dict[str, int]:
+    """Of each wheel, the number of the scale that it shares with others: with all, with those of its axle, with none.
+    Axles are counted from the rear, wheels by name."""
+    by = config.filter.wheel_scale_by
+    keys = {name: {"vehicle": 0, "axle": wheel.position_m[0], "wheel": name}[by] for name, wheel in config.wheel.items()}
+    order = sorted(set(keys.values()), key=lambda key: (isinstance(key, str), key))
+    return {name: order.index(key) for name, key in keys.items()}
+
+
+def calibrated(gnss: Gnss) -> bool:
+    """Whether the filter learns anything of a receiver's installation."""
+    return max(gnss.lever_arm_sigma_m, gnss.delay_sigma_ms, gnss.velocity_delay_sigma_ms) > 0

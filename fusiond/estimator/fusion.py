@@ -1,0 +1,220 @@
+"""Fusion: events in, outcomes and estimates out. The one door to the core; live and replay differ in who calls it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from msgspec import Struct
+
+from fusiond.config.schema import Config, Imu
+from fusiond.estimator.history import History
+from fusiond.estimator.solution import COVARIANCE_SIZE, Estimate, Mode, StateEstimate
+from fusiond.events import ImuSample, Invalid, Measurement, Received, Vector3
+from fusiond.filter.hot_start import Verdict, decided, leading, leads
+from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
+from fusiond.filter.observations import MODELS
+from fusiond.filter.observations.model import Unusable, within
+from fusiond.filter.parameters import IMU, SECOND, nanoseconds, plan, section_of
+from fusiond.filter.source_health import Belief, belief
+from fusiond.filter.state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_B,
+    FORCE_B,
+    GYRO_BIAS,
+    GYRO_BIAS_B,
+    LAST_VALUE,
+    MOUNT,
+    MOUNT_ERROR,
+    NEVER,
+    PHASE,
+    RATE_B,
+    RESETS,
+    RUNNING,
+    SCALE,
+    T_IMU,
+    T_POSITION,
+    T_START,
+    WHEEL_SCALE,
+    FilterState,
+    T,
+)
+from fusiond.filter.step import AnyKernel, Outcome
+from fusiond.filter.stored_state import StoredState, check, stored_state
+from fusiond.timeline.clock import Clock
+
+LOST_IMU_NS = 5 * SECOND  # without an inertial sample for so long the state is called lost
+
+
+class Receipt(Struct, frozen=True, gc=False):
+    """What became of an event that was received."""
+
+    measurement: Measurement
+    history: History
+    refusal: Outcome | None = None  # INVALID, TOO_OLD or DUPLICATE; None where it stands in the history
+    reason: str = ""  # of INVALID
+
+    @property
+    def outcome(self) -> Outcome:
+        """By now: what stands in the history is judged again when another event comes before it. Asking has the history
+        judge it; LookupError where it is forgotten there, long after the horizon."""
+        return self.history.outcome(self.measurement) if self.refusal is None else self.refusal
+
+
+class Fusion:
+    """Clock, history and filter of one vehicle, by its configuration."""
+
+    def __init__(self, config: Config, compiled: bool | None = None, stored: StoredState | None = None) -> None:
+        """`compiled` asks for the compiled kernel or its NumPy twin; by default the compiled one where it was built.
+        `stored` is what an earlier run left for a hot start; StoredStateError where it is not for this configuration."""
+        if stored is not None:
+            check(stored, config)
+        self.config = config
+        self.plan = plan(config, stored)
+        self.clock = Clock(config)
+        self.history = History(self.plan, compiled)
+        self._carried = FilterState(len(self.plan.sources), self.plan.size)  # the head, beyond the newest inertial sample
+        self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
+            source: (imu_values if model == IMU else MODELS[model].values, section_of(source, model, config))
+            for source, model in zip(self.plan.sources, self.plan.models, strict=True)
+        }
+        self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
+
+    def receive(self, received: Received) -> Receipt | None:
+        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only.
+
+        The source must be one of the configuration's; ValueError otherwise.
+        """
+        measurement = self.clock.align(received)
+        return None if measurement is None else self.take(measurement)
+
+    def take(self, measurement: Measurement) -> Receipt:
+        """Fuse an event that is aligned already."""
+        history, source = self.history, self.history.index.get(measurement.source)
+        if source is None:
+            raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.plan.sources)}")
+        try:
+            values = self._values(measurement)
+        except Unusable as unusable:
+            reason = str(unusable)
+            self.invalid[measurement.source][reason] += 1
+            return Receipt(measurement, history, history.count(source, Outcome.INVALID), reason)
+        return Receipt(measurement, history, history.offer(source, measurement, values))
+
+    def estimate_at(self, t_ns: int) -> Estimate:
+        """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
+        instant before the head's gives the head itself."""
+        self._carried.copy_from(self.history.head)
+        state, resets = self._told(self._carried)
+        self.history.kernel.predict(state, t_ns)
+        return self._estimate(state, t_ns, resets)
+
+    def settled(self) -> Estimate:
+        """The estimate at the horizon, which no late event can change any more."""
+        state, resets = self._told(self.history.settled())
+        return self._estimate(state, int(state.stamps[T]), resets)
+
+    def hot_start(self) -> Verdict:
+        """What became of the stored state."""
+        return Verdict(int(self.history.head.memory[self.plan.imu_source, LAST_VALUE]))
+
+    def to_store(self) -> StoredState | None:
+        """The newest state, for a hot start of the next run; None while there is none."""
+        head = self.history.head
+        if leads(head, self.plan):
+            head = leading(head)
+        return stored_state(head, self.config) if head.stamps[PHASE] == RUNNING else None
+
+    def outcomes(self) -> dict[str, dict[str, int]]:
+        """Counts of outcomes by source, by the last word on each event."""
+        return {
+            source: {outcome.name: int(self.history.counts[i, outcome]) for outcome in Outcome}
+            for i, source in enumerate(self.plan.sources)
+        }
+
+    def totals(self) -> dict[str, int]:
+        """Counts of outcomes over all sources."""
+        return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
+
+    def beliefs(self, t_ns: int) -> dict[str, Belief]:
+        """What each source is held to be at an instant (THEORY D1, D2)."""
+        head = self.history.head
+        start = int(head.stamps[T_START])
+        return {
+            source: belief(head.memory[i], head.source_stamps[i], t_ns, start if start != NEVER else t_ns)
+            for i, source in enumerate(self.plan.sources)
+        }
+
+    def _values(self, measurement: Measurement) -> tuple[float, ...]:
+        """A payload as a row of numbers. Raises Unusable."""
+        payload = measurement.payload
+        if isinstance(payload, Invalid):
+            raise Unusable(payload.reason)
+        to_values, section = self._rows[measurement.source]
+        values = to_values(payload, section)
+        if not math.isfinite(sum(values)):
+            raise Unusable("not finite")
+        return values
+
+    def _told(self, state: FilterState) -> tuple[FilterState, int]:
+        """What is told of a state, and how often that was reset: that the drive decides on a stored heading counts too."""
+        resets = int(state.stamps[RESETS])
+        if leads(state, self.plan):
+            return leading(state), resets
+        return state, resets + decided(state, self.plan)
+
+    def _estimate(self, state: FilterState, t_ns: int, resets: int) -> Estimate:
+        stamps = state.stamps
+        age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
+        if stamps[PHASE] != RUNNING:
+            return Estimate(t_ns, Mode.ALIGNING, age, resets, None)
+        answer = state_estimate(state, self.history.kernel)
+        north, east, _ = answer.sigma_position_n()
+        mode = Mode.NOMINAL
+        if math.hypot(north, east) > self.plan.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
+            mode = Mode.LOST
+        elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.plan.filter.position_timeout_s):
+            mode = Mode.DEAD_RECKONING
+        return Estimate(t_ns, mode, age, resets, answer)
+
+
+def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
+    """Specific force (3,) [m/s^2] and angular rate (3,) [rad/s]. Raises Unusable."""
+    within(sample.specific_force_b, imu.accel_limit, "beyond the accelerometer's range")
+    within(sample.angular_rate_b, imu.gyro_limit, "beyond the gyro's range")
+    return sample.specific_force_b + sample.angular_rate_b
+
+
+def state_estimate(state: FilterState, kernel: AnyKernel) -> StateEstimate:
+    """A running filter state in north-east-down, as it is published."""
+    x, auxiliary = state.nominal, state.auxiliary
+    numbers = kernel.answer(x, state.covariance)
+    told, nominal = numbers[: COVARIANCE_N.start].tolist(), x.tolist()
+    rate, force = auxiliary[RATE_B].tolist(), auxiliary[FORCE_B].tolist()
+    gyro_bias, accel_bias = nominal[GYRO_BIAS_B], nominal[ACCEL_BIAS_B]
+    sigma = [math.sqrt(max(variance, 0.0)) for variance in state.covariance.diagonal().tolist()]
+    return StateEstimate(
+        latitude=told[0],
+        longitude=told[1],
+        height=told[2],
+        velocity_n=_three(told[VELOCITY_N]),
+        quaternion_nb=tuple(told[QUATERNION_NB]),
+        angular_rate_b=(rate[0] - gyro_bias[0], rate[1] - gyro_bias[1], rate[2] - gyro_bias[2]),
+        acceleration_b=(force[0] - accel_bias[0], force[1] - accel_bias[1], force[2] - accel_bias[2]),
+        gyro_bias=_three(gyro_bias),
+        accel_bias=_three(accel_bias),
+        wheel_scale=nominal[WHEEL_SCALE.start],
+        mount=(nominal[MOUNT.start], nominal[MOUNT.start + 1]),
+        covariance=numbers[COVARIANCE_N].reshape(COVARIANCE_SIZE, COVARIANCE_SIZE),
+        sigma_gyro_bias=_three(sigma[GYRO_BIAS]),
+        sigma_accel_bias=_three(sigma[ACCEL_BIAS]),
+        sigma_wheel_scale=sigma[SCALE.start],
+        sigma_mount=(sigma[MOUNT_ERROR.start], sigma[MOUNT_ERROR.start + 1]),
+    )
+
+
+def _three(vector: list[float]) -> Vector3:
+    x, y, z = vector
+    return x, y, z

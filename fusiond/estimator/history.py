@@ -1,0 +1,218 @@
+"""Every event of the last `horizon` in order of (t_ns, source, sequence), with snapshots of the whole filter state.
+
+Theory of operation. An event is inserted where its key belongs, and that is all until somebody looks at the head, the rows
+or the counts: only then are the rows run, those of many events at once. The rows [0, applied) are in the head state. Where
+an event is inserted among them, the snapshots from the first row on that it changes are dropped, and the head is restored
+from the newest that is left before the rows after it are run again. So head and outcomes are a function of the set of
+events alone, whatever the order of their arrival, and whenever somebody looked.
+
+Which rows does an event change? All after it; and if it is an IMU sample, also those between it and the IMU sample before
+it, because they interpolate between the two. Therefore a snapshot is taken only after an IMU row, or where the IMU has been
+silent for so long that no later sample can change what went before.
+
+Which rows are applied when somebody looks? Those up to the newest IMU sample; and if the IMU has gone silent, those older
+by `imu_gap` than the newest event of all, so that the filter coasts on with its other sensors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.events import Measurement
+from fusiond.filter.parameters import IMU, Plan
+from fusiond.filter.state import NEVER, FilterState
+from fusiond.filter.step import ROW, Outcome, Rows, keep, make_kernel, run_one
+
+FIRST_ROWS = 4096
+FIRST_SNAPSHOTS = 64
+FORGET_EVERY = 256  # events; so many are run at once at the most
+
+
+class History:
+    """The events of the horizon and the filter state behind them."""
+
+    def __init__(self, plan: Plan, compiled: bool | None = None) -> None:
+        self.plan = plan
+        self.kernel = make_kernel(plan, compiled)
+        self.index = {source: i for i, source in enumerate(plan.sources)}
+        self.rerun = 0  # rows run again because of a late event
+        self.applied_ns = NEVER  # up to where events are applied: a function of the stamps received alone
+        self.settled_ns = NEVER - plan.horizon_ns  # no event older than this is taken any more
+        self._head = FilterState(len(plan.sources), plan.size)
+        self._counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
+        self._lags = [0 if model == IMU else plan.imu_gap_ns for model in plan.models]  # of what is applied behind an event
+        self._table: Rows = np.zeros(FIRST_ROWS, dtype=ROW)
+        self._begin = self._end = 0  # the live part of the table
+        self._applied = 0  # rows of the live part that are in the head; where it is rewound, in the newest snapshot
+        self._behind = self._rewound = False  # whether there are rows to run, and the head is to be restored before
+        self._snapshots = Snapshots(self._head)
+        self._attach()
+        self._until_forgetting = FORGET_EVERY
+
+    def _attach(self) -> None:
+        kept = self._snapshots
+        self.kernel.attach(self._head, self._table, self._counts, kept.numbers, kept.whole, kept.applied)
+
+    @property
+    def head(self) -> FilterState:
+        """The state after every event up to `applied_ns`. The same object ever: ask again after an event."""
+        self.catch_up()
+        return self._head
+
+    @property
+    def rows(self) -> Rows:
+        """The live rows, oldest first."""
+        self.catch_up()
+        return self._table[self._begin : self._end]
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Number of events (sources, outcomes), by the last word on each. The same array ever: ask again after an event."""
+        self.catch_up()
+        return self._counts
+
+    def offer(self, source: int, measurement: Measurement, values: tuple[float, ...]) -> Outcome | None:
+        """Put one event where it belongs in time. Returns the reason why it is not kept, None where it is."""
+        t_ns = measurement.t_ns
+        if t_ns < self.settled_ns:
+            return self.count(source, Outcome.TOO_OLD)
+        if self._end == len(self._table):
+            self._make_room()
+        first_changed = self.kernel.offer(
+            self._begin, self._end, t_ns, source, measurement.sequence, measurement.t_receive_ns, values
+        )
+        if first_changed < 0:
+            return self.count(source, Outcome.DUPLICATE)
+        self._end += 1
+        self._behind = True
+        if first_changed < self._applied:
+            self._rewind(first_changed)
+        reach_ns = t_ns - self._lags[source]
+        if reach_ns > self.applied_ns:
+            self.applied_ns, self.settled_ns = reach_ns, reach_ns - self.plan.horizon_ns
+        self._until_forgetting -= 1
+        if not self._until_forgetting:
+            self._forget()
+        return None
+
+    def count(self, source: int, outcome: Outcome) -> Outcome:
+        """Count an event that is not kept."""
+        self._counts[source, outcome] += 1
+        return outcome
+
+    def outcome(self, measurement: Measurement) -> Outcome:
+        """What became of an event, by now. LookupError where it is not kept any more."""
+        source, sequence = self.index[measurement.source], measurement.sequence
+        self.catch_up()
+        place = self.kernel.place(self._begin, self._end, measurement.t_ns, source, sequence)
+        if place < 0:
+            return Outcome(self._table["outcome"][self._begin + ~place])
+        raise LookupError(f"no event of {measurement.source} at {measurement.t_ns} is kept")
+
+    def settled(self) -> FilterState:
+        """The newest snapshot that no event still to come can change: the state about a snapshot interval before the
+        horizon."""
+        self._forget()
+        return self._snapshots.first()
+
+    def _rewind(self, first_changed: int) -> None:
+        """Have the rows run again from the newest snapshot on that holds no changed one."""
+        before, self._applied = self._applied, self._snapshots.rewind(first_changed)
+        self.rerun += before - self._applied
+        self._rewound = True
+
+    def catch_up(self) -> None:
+        """Apply the rows up to `applied_ns`. Whoever looks at the state, the rows or the counts has this done."""
+        if not self._behind:
+            return
+        kept, done = self._snapshots, False
+        if self._rewound:
+            self.kernel.restore(kept.end)
+        self._behind = self._rewound = False
+        while not done:  # the kernel stops for want of memory, and at a row that is not its own
+            before = self._applied
+            self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, self.applied_ns, kept.end)
+            if done:
+                return
+            if kept.end == len(kept.applied):
+                kept.make_room()
+                self._attach()
+            elif self._applied == before:
+                rows = self._table[self._begin : self._end]
+                self._applied = run_one(self._head, rows, before, self._counts, self.plan)
+                memory = (kept.numbers, kept.whole, kept.applied)
+                kept.end = keep(self._head, rows, self._applied, self.plan, memory, kept.end)
+
+    def _make_room(self) -> None:
+        """Move the live rows to the front of the table, or of a larger one if they fill half of it."""
+        self._forget()
+        live = self._end - self._begin
+        table = self._table if 2 * live < len(self._table) else np.zeros(4 * live, dtype=ROW)
+        table[:live] = self._table[self._begin : self._end]
+        self._table, self._begin, self._end = table, 0, live
+        self._attach()
+
+    def _forget(self) -> None:
+        """Drop the rows and snapshots that no event inside the horizon can need. When this is done changes no result."""
+        self.catch_up()
+        self._until_forgetting = FORGET_EVERY
+        gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
+        self._begin += gone
+        self._applied -= gone
+
+
+class Snapshots:
+    """Copies of the filter state, oldest first, in preallocated memory: rows begin..end of three arrays.
+
+    `applied` is the number of live rows in each. The first is the base: the state before the first live row.
+    """
+
+    def __init__(self, empty: FilterState) -> None:
+        self._empty = empty.copy()
+        self.numbers = np.zeros((FIRST_SNAPSHOTS, len(empty.numbers)))
+        self.whole: NDArray[np.int64] = np.zeros((FIRST_SNAPSHOTS, len(empty.whole)), dtype=np.int64)
+        self.applied: NDArray[np.int64] = np.zeros(FIRST_SNAPSHOTS, dtype=np.int64)
+        self.numbers[0], self.whole[0] = empty.numbers, empty.whole
+        self.begin, self.end = 0, 1
+
+    def first(self) -> FilterState:
+        """A copy of the base."""
+        state = self._empty.copy()
+        state.numbers[:], state.whole[:] = self.numbers[self.begin], self.whole[self.begin]
+        return state
+
+    def rewind(self, first_changed: int) -> int:
+        """Drop the newest ones as long as they hold a changed row. Returns the number of rows in the newest left."""
+        while self.applied[self.end - 1] > first_changed:
+            self.end -= 1
+        return int(self.applied[self.end - 1])
+
+    def make_room(self) -> None:
+        """Move the snapshots to the front of the memory, or of a larger one if they fill half of it."""
+        live = slice(self.begin, self.end)
+        count = self.end - self.begin
+        if 2 * count < len(self.applied):
+            numbers, whole, applied = self.numbers, self.whole, self.applied
+        else:
+            room = 4 * count
+            numbers = np.zeros((room, self.numbers.shape[1]))
+            whole, applied = np.zeros((room, self.whole.shape[1]), dtype=np.int64), np.zeros(room, dtype=np.int64)
+        numbers[:count], whole[:count], applied[:count] = self.numbers[live], self.whole[live], self.applied[live]
+        self.numbers, self.whole, self.applied = numbers, whole, applied
+        self.begin, self.end = 0, count
+
+    def forget(self, stamps: NDArray[np.int64], limit_ns: int) -> int:
+        """Drop the oldest snapshots as long as the next one has an unapplied row older than the limit: every row that it
+        has applied is then as old. Returns how many rows nobody needs any more."""
+        base = self.begin
+        while base + 1 < self.end:
+            applied = self.applied[base + 1]
+            if applied >= len(stamps) or stamps[applied] >= limit_ns:
+                break
+            base += 1
+        gone = int(self.applied[base])
+        self.begin = base
+        if gone:
+            self.applied[base : self.end] -= gone
+        return gone

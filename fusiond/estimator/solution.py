@@ -1,0 +1,101 @@
+"""The filter's answer at one instant: what is published, logged and shown, with its covariance."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.events import Vector3
+from fusiond.maths.portable import asin, atan2
+
+# Blocks of `StateEstimate.covariance`
+POSITION = slice(0, 3)  # m, north-east-down
+VELOCITY = slice(3, 6)  # m/s, north-east-down
+ATTITUDE = slice(6, 9)  # rad, small rotation about north, east, down
+COVARIANCE_SIZE = 9
+
+
+class Mode(enum.StrEnum):
+    """How far the estimate can be trusted."""
+
+    ALIGNING = "aligning"  # no state yet
+    NOMINAL = "nominal"  # position is being fixed
+    DEAD_RECKONING = "dead_reckoning"  # no position fix for a while; the covariance grows
+    LOST = "lost"  # the state is not worth using
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateEstimate:
+    """Nominal state of the filter and its uncertainty; position and velocity are those of the IMU.
+
+    The covariance is copied and made read-only. Raises ValueError where its shape is not (9, 9).
+    """
+
+    latitude: float  # rad, WGS-84
+    longitude: float  # rad
+    height: float  # m, on the datum of the position source
+    velocity_n: Vector3  # m/s
+    quaternion_nb: tuple[float, float, float, float]  # w, x, y, z
+    angular_rate_b: Vector3  # rad/s, freed of bias
+    acceleration_b: Vector3  # m/s^2, specific force freed of bias: (0, 0, -9.8) when level and at rest
+    gyro_bias: Vector3  # rad/s
+    accel_bias: Vector3  # m/s^2
+    wheel_scale: float  # what all wheels read too much: 0.01 is 1 %
+    mount: tuple[float, float]  # rad, pitch and yaw of the IMU against the vehicle
+    covariance: NDArray[np.float64]  # (9, 9), blocks POSITION, VELOCITY, ATTITUDE
+    sigma_gyro_bias: Vector3  # rad/s
+    sigma_accel_bias: Vector3  # m/s^2
+    sigma_wheel_scale: float
+    sigma_mount: tuple[float, float]  # rad
+
+    def __post_init__(self) -> None:
+        covariance = np.array(self.covariance, dtype=np.float64)
+        if covariance.shape != (COVARIANCE_SIZE, COVARIANCE_SIZE):
+            raise ValueError(f"covariance must be {COVARIANCE_SIZE} x {COVARIANCE_SIZE}, not {covariance.shape}")
+        covariance.setflags(write=False)
+        object.__setattr__(self, "covariance", covariance)
+
+    def euler(self) -> Vector3:
+        """Roll, pitch, yaw [rad] of the body against north-east-down, Z-Y-X convention:
+        mat_nb = Rz(yaw) Ry(pitch) Rx(roll). Roll and yaw lie in (-pi, pi], pitch in [-pi/2, pi/2].
+        """
+        w, x, y, z = self.quaternion_nb
+        roll = atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = asin(2 * (w * y - z * x))
+        yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return _half_open(roll), pitch, _half_open(yaw)
+
+    def sigma_position_n(self) -> Vector3:
+        """Position sigmas north, east, down [m]."""
+        return self._sigma(0), self._sigma(1), self._sigma(2)
+
+    def sigma_velocity(self) -> float:
+        """Root mean square of the velocity sigmas north and east [m/s]: the horizontal sigma per axis."""
+        return math.sqrt((float(self.covariance[3, 3]) + float(self.covariance[4, 4])) / 2)
+
+    def sigma_yaw(self) -> float:
+        """Sigma of the rotation about down [rad]: that of the yaw angle, as long as the vehicle is near level."""
+        return self._sigma(8)
+
+    def _sigma(self, index: int) -> float:
+        return math.sqrt(float(self.covariance[index, index]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The filter's answer at `t_ns`; `state` is None while there is none (aligning, or lost beyond use)."""
+
+    t_ns: int  # the instant it is valid for
+    mode: Mode
+    age_ns: int | None  # t_ns less the stamp of the last IMU sample behind it; None before the first sample
+    resets: int  # how often the state was reset (jumped)
+    state: StateEstimate | None
+
+
+def _half_open(angle: float) -> float:
+    """An angle of [-pi, pi] in (-pi, pi]."""
+    return math.pi if angle == -math.pi else angle

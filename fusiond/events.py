@@ -1,0 +1,114 @@
+"""Events on their way into the filter: what an adapter received, and what the clock made of it. All SI, all frozen.
+
+An adapter yields `Received`: a typed payload with the sensor's own stamp (if it has one), the clock that the stamp was
+read from, and the stamp of its receipt. `fusiond.timeline.clock` turns it into a `Measurement`: the same payload with one
+stamp `t_ns` on the one time line. Stamps are integers of nanoseconds everywhere, without defaults. The types are msgspec
+structs because a replay makes millions of them: a frozen one costs a tenth of a frozen dataclass.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+Vector3 = tuple[float, float, float]
+
+
+class ImuSample(Struct, frozen=True, gc=False):
+    """Inertial sample in body axes (forward, right, down)."""
+
+    specific_force_b: Vector3  # m/s^2, accelerometer: (0, 0, -9.8) when level and at rest
+    angular_rate_b: Vector3  # rad/s
+
+
+class GnssPosition(Struct, frozen=True, gc=False):
+    """Antenna position (WGS-84). A sigma is None where the receiver gives none."""
+
+    latitude: float  # rad
+    longitude: float  # rad
+    height: float  # m above the ellipsoid (or mean sea level, where the receiver gives nothing else)
+    sigma_horizontal: float | None = None  # m, one standard deviation per axis
+    sigma_vertical: float | None = None  # m
+
+
+class GnssVelocity(Struct, frozen=True, gc=False):
+    """Antenna velocity over ground, north-east-down. `down` is None where the receiver gives speed and course only."""
+
+    north: float  # m/s
+    east: float  # m/s
+    down: float | None = None  # m/s
+    sigma: float | None = None  # m/s, one standard deviation per axis
+
+
+class WheelSpeed(Struct, frozen=True, gc=False):
+    """Speed of one wheel's circumference along its rolling direction, positive forward."""
+
+    speed: float  # m/s
+    sigma: float = 0.0  # m/s, one standard deviation of this reading, on top of what the configuration says
+
+
+class Pressure(Struct, frozen=True, gc=False):
+    """Static air pressure."""
+
+    absolute: float  # Pa
+    temperature: float  # K, of the sensor
+
+
+class ClockPair(Struct, frozen=True, gc=False):
+    """One instant read from two clocks at once (MAVLink SYSTEM_TIME): `Received.t_sensor_ns` on `Received.clock` is
+    `t_ns` on `clock`. It aligns clocks and never reaches the filter.
+
+    With HOST_CLOCK as `clock` it is the answer to a question (MAVLink TIMESYNC), asked at `t_ns` of the host's time line:
+    the other clock was read at some instant between that and the receipt."""
+
+    clock: str
+    t_ns: int
+
+
+class Invalid(Struct, frozen=True, gc=False):
+    """A sample which its own protocol declares unusable (fault bit, bad checksum, no fix); counted with its reason."""
+
+    reason: str
+
+
+Payload = ImuSample | GnssPosition | GnssVelocity | WheelSpeed | Pressure
+AnyPayload = Payload | ClockPair | Invalid
+
+
+class Received(Struct, frozen=True, gc=False):
+    """What an input adapter yields: one sample of one source, as it came in.
+
+    `source` names a stream of one kind of payload (`imu0`, `gps0.position`, `gps0.velocity`, `rear_left`). `sequence`
+    counts a source's samples in the order of the sensor's sending, as far as the adapter can tell. `clock` names the
+    clock of `t_sensor_ns`: `unix`, `<link>/<system>/boot`, or an empty string together with None where there is no
+    stamp.
+    """
+
+    source: str
+    sequence: int
+    clock: str
+    t_sensor_ns: int | None
+    t_receive_ns: int
+    payload: AnyPayload
+
+
+class Measurement(Struct, frozen=True, gc=False):
+    """A payload placed on the time line: it tells of the instant `t_ns`. The order of events is `key`."""
+
+    t_ns: int
+    source: str
+    sequence: int
+    t_receive_ns: int
+    payload: Payload | Invalid
+
+    @property
+    def key(self) -> tuple[int, str, int]:
+        return self.t_ns, self.source, self.sequence
+
+
+UNIX_CLOCK = "unix"
+HOST_CLOCK = "host"  # that of the receipts
+
+
+def boot_clock(link: str, system: int = 1) -> str:
+    """The name of the clock that counts from the boot of one MAVLink system on one link."""
+    return f"{link}/{system}/boot"

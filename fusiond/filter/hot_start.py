@@ -1,0 +1,147 @@
+"""What a stored state is worth at the start: checked against what was gathered, before any of it is believed.
+
+Biases and calibrations are first values, with variances aged by their random walks. The heading is another matter: a
+vehicle can have been turned while nobody looked, and a running filter does not find back from a wrong heading. So it is
+only ever one hypothesis of the bank, next to the twelve all round, and the drive decides. Where place, standstill and
+level agree it leads the bank, and as long as it does, its state is told: a parked vehicle has one at once.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+from fusiond.filter.observations.model import LEVER_ARM_B
+from fusiond.filter.parameters import Plan
+from fusiond.filter.state import CHOOSING, FIX_E, FIX_VARIANCE, LAST_VALUE, PHASE, RESETS, RUNNING, STORED, FilterState, T
+from fusiond.filter.stored_state import StoredState
+from fusiond.maths.portable import square
+from fusiond.maths.rotation import matrix_from_euler, product
+from fusiond.maths.wgs84 import Array, ecef, mat_ne
+
+BELIEVED_WEIGHT = 0.8  # of the stored heading where all agrees: it takes evidence, not chance, to collapse the bank on it
+LEADS = 0.5  # weight from which it is told as the state
+DOUBTED_WEIGHT = 0.5  # and where only the place does
+BELIEVED_SIGMA = math.radians(3.0)  # rad, at the least: parked is not nailed down
+DOUBTED_SIGMA = math.radians(15.0)  # rad, at the least: some turning of the wheel
+USELESS_SIGMA = math.radians(30.0)  # rad: a heading no better than this is none
+LEVEL_AGREES = math.radians(1.5)  # rad: passengers and fuel tilt no vehicle more; on a slope turning does
+SHARP = 10.0  # m: places known no better than this tell little
+ROLLED = 20.0  # m, how far a vehicle that was parked may have gone before the filter starts
+BRIEF = 5.0  # s: for so long after a stop in motion its heading is worth something
+
+
+class Verdict(IntEnum):
+    """What became of a stored state at the start: LAST_VALUE in the memory of the inertial sensor."""
+
+    NONE = 0  # there is none, or the filter has not started yet
+    BELIEVED = 1
+    DOUBTED = 2
+    OTHERWISE_KNOWN = 3
+    MOVED = 4
+    IN_MOTION = 5
+    VAGUE = 6
+    FUTURE = 7
+    STALE = 8
+
+
+WORDS = {
+    Verdict.NONE: "no start yet",
+    Verdict.BELIEVED: "heading, biases and calibration taken: same place, at rest, level as before",
+    Verdict.DOUBTED: "biases and calibration taken; its heading is tried among others",
+    Verdict.OTHERWISE_KNOWN: "biases and calibration taken; the heading is known otherwise",
+    Verdict.MOVED: "biases and calibration taken; its heading and position ignored: the vehicle is elsewhere",
+    Verdict.IN_MOTION: "biases and calibration taken; its heading ignored: it was in motion, too long ago",
+    Verdict.VAGUE: "biases and calibration taken; its heading ignored: it was not known well",
+    Verdict.FUTURE: "ignored: it is from the future",
+    Verdict.STALE: "ignored: it is too old",
+}
+
+
+class Heading(NamedTuple):
+    """A stored heading, its sigma [rad], and its weight in the bank."""
+
+    yaw: float
+    sigma: float
+    weight: float
+
+
+def recall(state: FilterState, plan: Plan) -> tuple[StoredState | None, Verdict]:
+    """The stored state, if it is of use at the state's instant: at the first start only, and not beyond its age."""
+    stored = plan.stored
+    if stored is None or state.stamps[RESETS]:
+        return None, Verdict.NONE
+    age_ns = int(state.stamps[T]) - stored.t_ns
+    if age_ns < 0:
+        return None, Verdict.FUTURE
+    return (None, Verdict.STALE) if age_ns > plan.stored_most_ns else (stored, Verdict.OTHERWISE_KNOWN)
+
+
+def aged(stored: StoredState, state: FilterState, plan: Plan) -> tuple[list[float], list[float]]:
+    """Values of gyro bias, accelerometer bias and calibrations, and their variances now: grown by the random walks, and
+    never larger than those of a cold start. What is frozen stays at zero."""
+    age, noise = (int(state.stamps[T]) - stored.t_ns) * 1e-9, plan.noise
+    values = [*stored.gyro_bias, *stored.accel_bias, *stored.calibrations]
+    kept = [*stored.gyro_bias_variance, *stored.accel_bias_variance, *stored.calibration_variances]
+    walks = [noise.gyro_bias] * 3 + [noise.accel_bias] * 3 + list(noise.calibrations)
+    cold = [square(plan.imu.gyro_bias_sigma)] * 3 + [square(plan.imu.accel_bias_sigma)] * 3
+    cold += plan.calibration_variances.tolist()
+    variances = [min(old + walk * age, most) for old, walk, most in zip(kept, walks, cold, strict=True)]
+    return [value if most > 0 else 0.0 for value, most in zip(values, cold, strict=True)], variances
+
+
+def heading(
+    stored: StoredState, state: FilterState, source: int, level: tuple[float, float] | None, plan: Plan
+) -> tuple[Heading | None, Verdict]:
+    """What the stored heading is worth, where the last fix came by `source`; `level` is roll and pitch now [rad] of a
+    vehicle at rest, None in motion."""
+    sigma, age = math.sqrt(stored.yaw_variance), (int(state.stamps[T]) - stored.t_ns) * 1e-9
+    if sigma > USELESS_SIGMA:
+        return None, Verdict.VAGUE
+    if not stored.at_rest and age > BRIEF:
+        return None, Verdict.IN_MOTION
+    reach = 0.0
+    if not stored.at_rest:
+        reach = plan.filter.v_max_mps * age
+    elif level is None:
+        reach = ROLLED
+    spread = stored.position_variance + float(state.auxiliary[FIX_VARIANCE][0])
+    if max(0.0, _distance(stored, state.auxiliary[FIX_E], plan.parameters[source][LEVER_ARM_B]) - reach) > math.sqrt(
+        plan.gates[2] * spread
+    ):
+        return None, Verdict.MOVED
+    agrees = level is not None and max(abs(level[0] - stored.roll), abs(level[1] - stored.pitch)) <= LEVEL_AGREES
+    if agrees and stored.at_rest and spread <= square(SHARP):
+        return Heading(stored.yaw, max(sigma, BELIEVED_SIGMA), BELIEVED_WEIGHT), Verdict.BELIEVED
+    return Heading(stored.yaw, max(sigma, DOUBTED_SIGMA), DOUBTED_WEIGHT), Verdict.DOUBTED
+
+
+def leads(state: FilterState, plan: Plan) -> bool:
+    """Whether a bank is so sure of the stored heading that its state is told."""
+    if state.stamps[PHASE] != CHOOSING or float(state.memory[plan.imu_source, LAST_VALUE]) != Verdict.BELIEVED:
+        return False
+    return bool(state.bank[STORED, 0] >= LEADS)
+
+
+def decided(state: FilterState, plan: Plan) -> bool:
+    """Whether the drive has replaced a stored heading that was told: the told state has jumped."""
+    believed = float(state.memory[plan.imu_source, LAST_VALUE]) == Verdict.BELIEVED
+    return bool(believed and (state.stamps[PHASE] == RUNNING or state.stamps[RESETS] > 0))
+
+
+def leading(state: FilterState) -> FilterState:
+    """A copy that runs with the stored heading: to be told, and thrown away."""
+    told, hypothesis = state.copy(), state.hypothesis(STORED)
+    told.nominal[:], told.covariance[:] = hypothesis.nominal, hypothesis.covariance
+    told.stamps[PHASE] = RUNNING
+    return told
+
+
+def _distance(stored: StoredState, fix_e: Array, lever_b: Array) -> float:
+    """How far [m], horizontally, the antenna is from where it was."""
+    place_e = ecef(stored.latitude, stored.longitude, stored.height)
+    to_n = mat_ne(place_e)
+    arm_n = product(matrix_from_euler(stored.roll, stored.pitch, stored.yaw), lever_b)
+    north, east, _ = product(to_n, fix_e - place_e) - arm_n
+    return math.sqrt(square(north) + square(east))

@@ -1,0 +1,1 @@
+"""The loop over many events, compiled for two sizes of the state."""

@@ -1,0 +1,7 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The compiled hot loop (kernel.pxi) for the ordinary state: see there."""
+
+cdef enum:
+    n = 18  # error states
+
+include "kernel.pxi"

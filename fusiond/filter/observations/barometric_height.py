@@ -1,0 +1,60 @@
+"""Barometric height: the pressure altitude of the standard atmosphere (ICAO Doc 7488/3) is the height and an offset, which
+is a state: weather, geoid, and the sensor's own error."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusiond.config.schema import Barometer
+from fusiond.events import Pressure
+from fusiond.filter.observations.model import CORRELATION, PARAMETERS, Observation, Unusable
+from fusiond.filter.state import HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR, POSITION, POSITION_E, FilterState
+from fusiond.maths.portable import exp, log, square
+from fusiond.maths.wgs84 import Array, geodetic, mat_ne
+
+ALTITUDE, VARIANCE = 0, 1  # m, m^2: values
+
+PRESSURE_LIMITS = (1_000.0, 120_000.0)  # Pa: 31 km up, below the Dead Sea
+GAS_CONSTANT = 287.05287  # J/(kg K), of dry air
+STANDARD_GRAVITY = 9.80665  # m/s^2
+NOMINAL_RADIUS = 6_356_766.0  # m, of the Earth, between geopotential and geometric height
+LAYERS = (  # base: pressure [Pa], geopotential height [m], temperature [K], and its gradient above [K/m]
+    (101_325.0, 0.0, 288.15, -0.0065),
+    (22_632.040, 11_000.0, 216.65, 0.0),
+    (5_474.8774, 20_000.0, 216.65, 0.001),
+)
+
+
+def parameters(barometer: Barometer) -> Array:
+    row = np.zeros(PARAMETERS)
+    row[CORRELATION] = barometer.correlation_s
+    return row
+
+
+def values(reading: Pressure, barometer: Barometer) -> tuple[float, ...]:
+    """Pressure altitude [m], as a geometric height, and its variance [m^2]. Raises Unusable."""
+    if not PRESSURE_LIMITS[0] <= reading.absolute <= PRESSURE_LIMITS[1]:
+        raise Unusable("impossible pressure" if math.isfinite(reading.absolute) else "not finite")
+    geopotential = pressure_altitude(reading.absolute)
+    return NOMINAL_RADIUS * geopotential / (NOMINAL_RADIUS - geopotential), square(barometer.sigma_m)
+
+
+def pressure_altitude(pressure: float) -> float:
+    """Geopotential height [m] at which the standard atmosphere has a pressure [Pa], up to 32 km."""
+    base, height, temperature, gradient = next((layer for layer in LAYERS[:0:-1] if pressure < layer[0]), LAYERS[0])
+    depth = -GAS_CONSTANT / STANDARD_GRAVITY * log(pressure / base)  # m/K: height over temperature
+    if gradient == 0:
+        return height + temperature * depth
+    return height + temperature / gradient * (exp(gradient * depth) - 1)
+
+
+def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+    """Innovation (1,) [m], up: pressure altitude less height and offset. The height is that of the IMU."""
+    x = state.nominal
+    jacobian = np.zeros((1, state.size))
+    jacobian[0, POSITION] = -mat_ne(x[POSITION_E])[2]  # up is minus down
+    jacobian[0, HEIGHT_OFFSET_ERROR] = 1.0
+    innovation = row[ALTITUDE] - geodetic(x[POSITION_E])[2] - x[HEIGHT_OFFSET.start]
+    return Observation(np.array([innovation]), jacobian, np.array([row[VARIANCE]]))

@@ -1,0 +1,193 @@
+"""The configuration as the kernel wants it: numbers in arrays, one row per source, everything derived once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fusiond.config.schema import Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
+from fusiond.filter.measurement_update import chi_square, correlation_factor
+from fusiond.filter.observations import CONSTRAINTS, MODELS, wheel_speed
+from fusiond.filter.observations.model import CLUTTER, COMPANION, NOISE_LEAST, NOISE_MOST, PARAMETERS, SHARED
+from fusiond.filter.state import (
+    ANTENNA_ERROR,
+    CALIBRATIONS,
+    DELAYS_ERROR,
+    ERROR_SIZE,
+    FURTHER_SCALES_ERROR,
+    HEIGHT_OFFSET_ERROR,
+    MOUNT_ERROR,
+    SCALE,
+    WIDE_SIZE,
+)
+from fusiond.filter.stored_state import StoredState
+from fusiond.filter.strapdown import ProcessNoise
+from fusiond.maths.portable import square
+from fusiond.maths.wgs84 import Array
+
+IMU = -1  # stands for the inertial sensor in a row's `model`
+MODEL = {model.name: number for number, model in enumerate(MODELS)}
+SECOND = 1_000_000_000  # ns
+CREEPING_ALIKE = 1.0  # s: for so long a vehicle that creeps unseen keeps its speed
+
+
+def nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    sources: tuple[str, ...]  # sorted by name: the index of a source orders events as its name does
+    models: tuple[int, ...]  # of each source: place in MODELS, or IMU
+    parameters: Array  # (sources, PARAMETERS)
+    constraints: Array  # (3, PARAMETERS): non-holonomic, zero velocity, zero rotation
+    gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
+    noise: ProcessNoise
+    size: int  # of the error state
+    scales: tuple[str, ...]  # names of the wheel scales, by their number
+    calibration_variances: Array  # (size - CALIBRATIONS,): first ones
+    imu_source: int
+    wheels: tuple[int, ...]  # indices of the sources that are wheels
+    velocities: tuple[int, ...]  # and of those that are GNSS velocities
+    horizon_ns: int
+    snapshot_interval_ns: int
+    imu_gap_ns: int
+    restart_gap_ns: int
+    gnss_reset_ns: int
+    gnss_return_ns: int
+    heading_variance: float  # rad^2: the spread of the headings at which the bank is collapsed
+    constraint_interval_ns: int
+    still_after_ns: int
+    still_gyro: float  # rad/s
+    zero_velocity_factor: float  # creeping stays alike: weighs zero velocities down
+    filter: Filter
+    motion: Motion
+    imu: Imu
+    stored: StoredState | None  # of an earlier run, for a hot start
+    stored_most_ns: int  # how old it may be
+
+
+def section_of(source: str, model: int, config: Config) -> Any:
+    """The table of the configuration that a source stands in."""
+    if model == IMU:
+        return config.imu[source]
+    table: dict[str, Any] = getattr(config, MODELS[model].table or "")
+    return table[source.removesuffix(MODELS[model].suffix)]
+
+
+def plan(config: Config, stored: StoredState | None = None) -> Plan:
+    """Lay a configuration out for the kernel, with what an earlier run has stored."""
+    found = dict.fromkeys(config.imu, IMU)
+    for number, model in enumerate(MODELS):
+        if model.table is not None:
+            found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
+    sources = tuple(sorted(found))
+    models = tuple(found[source] for source in sources)
+    rows = [_parameters(source, sources, model, config) for source, model in zip(sources, models, strict=True)]
+    first, walks = _calibrations(config)
+    (imu,) = config.imu.values()
+    motion, settings = config.motion, config.filter
+    return Plan(
+        sources=sources,
+        models=models,
+        parameters=np.array(rows),
+        constraints=np.array([constraint.parameters(motion) for constraint in CONSTRAINTS]),
+        gates=(math.inf, *(chi_square(settings.gate_probability, freedom) for freedom in (1, 2, 3))),
+        noise=ProcessNoise(
+            accel=square(imu.accel_noise),
+            gyro=square(imu.gyro_noise),
+            accel_bias=square(imu.accel_bias_walk),
+            gyro_bias=square(imu.gyro_bias_walk),
+            calibrations=tuple(walks.tolist()),
+        ),
+        size=CALIBRATIONS + len(first),
+        scales=_scale_names(config),
+        calibration_variances=first,
+        imu_source=models.index(IMU),
+        wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
+        velocities=tuple(i for i, model in enumerate(models) if model == MODEL["gnss_velocity"]),
+        horizon_ns=nanoseconds(settings.horizon_s),
+        snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
+        imu_gap_ns=nanoseconds(settings.imu_gap_s),
+        restart_gap_ns=nanoseconds(settings.restart_gap_s),
+        gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
+        gnss_return_ns=nanoseconds(min(settings.gnss_return_s, settings.gnss_reset_s)),
+        heading_variance=square(math.radians(settings.heading_spread_deg)),
+        constraint_interval_ns=nanoseconds(motion.interval_s),
+        still_after_ns=nanoseconds(motion.still_after_s),
+        still_gyro=math.radians(motion.still_gyro_deg_s),
+        zero_velocity_factor=correlation_factor(motion.interval_s, CREEPING_ALIKE),
+        filter=settings,
+        motion=motion,
+        imu=imu,
+        stored=stored,
+        stored_most_ns=nanoseconds(config.state.max_age_s),
+    )
+
+
+def _parameters(source: str, sources: tuple[str, ...], model: int, config: Config) -> Array:
+    """The row of one source: what its model wants, and what all have."""
+    if model == IMU:
+        return np.zeros(PARAMETERS)
+    section = section_of(source, model, config)
+    row = MODELS[model].parameters(section)
+    row[NOISE_LEAST], row[NOISE_MOST] = square(section.noise_least), square(section.noise_most)
+    row[SHARED], row[COMPANION] = _shared(section, model, config), -1
+    if model == MODEL["wheel_speed"]:
+        row[wheel_speed.SCALE_STATE] = scale_state(wheel_groups(config)[source])
+    if not isinstance(section, Gnss):
+        return row
+    row[CLUTTER] = section.outlier_share if section.outliers == "mixture" else 0.0
+    velocity = source.removesuffix(".position") + ".velocity"
+    if model == MODEL["gnss_position"] and velocity in sources:
+        row[COMPANION] = sources.index(velocity)
+    return row
+
+
+def _shared(section: Any, model: int, config: Config) -> float:
+    """By what each variance s_i^2 of a group grows so that all of them, fused one by one, are worth no more than their
+    shared error s_c allows (THEORY A5): with 1 + s_c^2 sum 1 / s_j^2 they are worth s_c^2 + 1 / sum 1 / s_j^2 together."""
+    if not isinstance(section, Gnss | Wheel) or section.group is None or model == MODEL["gnss_velocity"]:
+        return 1.0
+    if isinstance(section, Wheel):
+        sigmas = [wheel.sigma_mps for wheel in config.wheel.values() if wheel.group == section.group]
+        return 1 + square(section.shared_sigma_mps) * sum(1 / square(sigma) for sigma in sigmas)
+    sigmas = [gnss.position_sigma_m for gnss in config.gnss.values() if gnss.group == section.group]
+    return 1 + square(section.shared_sigma_m) * sum(1 / square(sigma) for sigma in sigmas)
+
+
+def _scale_names(config: Config) -> tuple[str, ...]:
+    """Of each wheel scale: the one of all, or with the wheels that share it."""
+    groups = wheel_groups(config)
+    if len(set(groups.values())) < 2:
+        return ("wheel_scale",)
+    wheels = ["_".join(name for name, group in groups.items() if group == number) for number in sorted(set(groups.values()))]
+    return tuple(f"wheel_scale_{names}" for names in wheels)
+
+
+def scale_state(group: int) -> int:
+    """The error state of a group's wheel scale."""
+    return SCALE.start if group == 0 else FURTHER_SCALES_ERROR.start + group - 1
+
+
+def _calibrations(config: Config) -> tuple[Array, Array]:
+    """First variances, and random walks squared, of the error states from CALIBRATIONS on: those that are frozen have
+    neither. Short where none of the wider state is wanted: it costs time."""
+    settings = config.filter
+    first, walks = np.zeros(WIDE_SIZE), np.zeros(WIDE_SIZE)
+    scales = [scale_state(group) for group in {0, *wheel_groups(config).values()}]
+    first[scales] = square(settings.wheel_scale_sigma)
+    walks[scales] = square(settings.wheel_scale_walk) if settings.wheel_scale_sigma else 0.0
+    first[MOUNT_ERROR] = square(math.radians(settings.mount_sigma_deg))
+    walks[MOUNT_ERROR] = square(math.radians(settings.mount_walk_deg)) if settings.mount_sigma_deg else 0.0
+    for gnss in filter(calibrated, config.gnss.values()):
+        first[ANTENNA_ERROR] = square(gnss.lever_arm_sigma_m)
+        first[DELAYS_ERROR] = square(gnss.delay_sigma_ms * 1e-3), square(gnss.velocity_delay_sigma_ms * 1e-3)
+    for barometer in config.barometer.values():
+        first[HEIGHT_OFFSET_ERROR] = square(barometer.offset_sigma_m)
+        walks[HEIGHT_OFFSET_ERROR] = square(barometer.offset_walk_m)
+    size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
+    return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

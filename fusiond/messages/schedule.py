@@ -1,0 +1,319 @@
+"""What goes out at a tick: the state, and when they are due the settled state, innovations, events and the health.
+
+All but the latencies and what is said of inputs and outputs depends on the events and their receive stamps alone, so a
+replay makes the same messages as the live run did. A reset's reason is read off the filter's state: it is not finite, it
+aligned anew, or else a source that was rejected for long is believed again (the one fused beyond its gate).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
+from typing import Any, NamedTuple, cast
+
+import msgspec
+import numpy as np
+
+from fusiond import __version__
+from fusiond.config.schema import Config
+from fusiond.engine import FIELDS, RATE_DENOMINATOR, Engine, totals
+from fusiond.estimator.fusion import Fusion, Receipt
+from fusiond.estimator.solution import Mode
+from fusiond.events import Received
+from fusiond.filter.calibration import calibrations
+from fusiond.filter.hot_start import decided
+from fusiond.filter.observations import MODELS
+from fusiond.filter.parameters import IMU
+from fusiond.filter.source_health import STATUSES
+from fusiond.filter.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
+from fusiond.filter.step import Kernel
+from fusiond.messages.innovations import Innovations
+from fusiond.messages.types import (
+    MESSAGES,
+    SCHEMA_VERSION,
+    Calibration,
+    ClockHealth,
+    ConfigMessage,
+    EventMessage,
+    HealthMessage,
+    InfoMessage,
+    InputHealth,
+    LatencyHealth,
+    Message,
+    OutcomeCounts,
+    OutputHealth,
+    Probabilities,
+    Severity,
+    SourceHealth,
+    SourceStatus,
+    StateMessage,
+    settled_message,
+)
+from fusiond.timeline.clock import ClockReport
+
+SECOND = 1_000_000_000  # ns
+HEALTH_NS = SECOND  # between two of them, when nothing changes
+LOOK_NS = SECOND // 10  # between two looks at what the sources are held to be
+ABSENT_NS = 2 * SECOND  # a source that has brought nothing for so long is not present
+SEVERITY: Mapping[Mode, Severity] = {
+    Mode.ALIGNING: "notice",
+    Mode.NOMINAL: "info",
+    Mode.DEAD_RECKONING: "warning",
+    Mode.LOST: "critical",
+}
+
+
+class Surroundings(NamedTuple):
+    """What the health tells of the shell around the engine."""
+
+    latency: LatencyHealth = LatencyHealth()
+    inputs: Mapping[str, InputHealth] = {}
+    outputs: Mapping[str, OutputHealth] = {}
+
+
+class Publication:
+    """The messages of one engine. `surroundings` is asked whenever a health is made."""
+
+    def __init__(self, config: Config, engine: Engine, surroundings: Callable[[], Surroundings] = Surroundings) -> None:
+        self._vehicle, self._engine, self._surroundings = config.vehicle.name, engine, surroundings
+        settled = config.publish.settled_hz
+        self._settled_ns = SECOND / Fraction(settled).limit_denominator(RATE_DENOMINATOR) if settled else None
+        self._next_settled_ns = self._next_health_ns = 0  # from the first event
+        self._last_settled_ns: int = NEVER
+        self._innovations = Innovations(self._vehicle, engine.fusion) if config.publish.innovations else None
+        self._sources = Sources(engine.fusion)
+        self._changes = Changes(config, engine.fusion)
+
+    def add(self, event: Received, receipt: Receipt) -> None:
+        """Take note of a measurement and what became of it."""
+        self._sources.add(event)
+        if self._innovations:
+            self._innovations.add(receipt)
+
+    def at(self, since_start_ns: int, state: StateMessage) -> Iterator[Message]:
+        """Everything that goes out at a tick, the state first."""
+        yield state
+        if self._settled_ns is not None and since_start_ns >= self._next_settled_ns:
+            self._next_settled_ns = int((since_start_ns // self._settled_ns + 1) * self._settled_ns)
+            yield from self._settled()
+        if self._innovations:
+            yield from self._innovations.judged()
+        events = list(self._changes.since(state, self._sources.present(state.t_ns)))
+        yield from events
+        if events or since_start_ns >= self._next_health_ns:
+            if since_start_ns >= self._next_health_ns:
+                self._next_health_ns = (since_start_ns // HEALTH_NS + 1) * HEALTH_NS
+                self._sources.measure_rates(state.t_ns)
+            yield self.health(state)
+
+    def _settled(self) -> Iterator[Message]:
+        estimate = self._engine.fusion.settled()
+        if estimate.t_ns > self._last_settled_ns:  # not before the first, and each but once
+            self._last_settled_ns = estimate.t_ns
+            yield settled_message(estimate, self._vehicle, totals(self._engine.fusion))
+
+    def health(self, state: StateMessage) -> HealthMessage:
+        """How everything is at the instant of a state."""
+        around, began = self._surroundings(), self._engine.first_ns
+        return HealthMessage(
+            vehicle=self._vehicle,
+            t_ns=state.t_ns,
+            version=__version__,
+            uptime_s=0.0 if began is None else (state.t_ns - began) / SECOND,
+            mode=state.mode,
+            resets=state.resets,
+            reset_reason=self._changes.reset_reason,
+            outcomes=state.outcomes,
+            latency_ms=around.latency,
+            sources=self._sources.health(state.t_ns),
+            inputs=dict(around.inputs),
+            outputs=dict(around.outputs),
+            calibration={
+                name: Calibration(value=value, sigma=sigma)
+                for name, (value, sigma) in calibrations(self._engine.fusion.plan, self._engine.fusion.history.head).items()
+            },
+        )
+
+
+class Sources:
+    """The health of every source of measurements."""
+
+    def __init__(self, fusion: Fusion) -> None:
+        self._fusion = fusion
+        self._received: dict[str, int] = {}  # last receipt [ns]
+        self._clocks: dict[str, str] = {}
+        self._rates = dict.fromkeys(fusion.plan.sources, 0.0)
+        self._counted, self._counted_ns = fusion.history.counts.sum(axis=1), 0
+
+    def add(self, event: Received) -> None:
+        self._received[event.source] = event.t_receive_ns
+        self._clocks[event.source] = event.clock
+
+    def present(self, t_ns: int) -> frozenset[str]:
+        """The sources of which something was received lately."""
+        return frozenset(source for source, last in self._received.items() if t_ns - last < ABSENT_NS)
+
+    def measure_rates(self, t_ns: int) -> None:
+        """Receipts a second since the last time."""
+        counted = self._fusion.history.counts.sum(axis=1)
+        if self._counted_ns:
+            rates = (counted - self._counted) * (SECOND / (t_ns - self._counted_ns))
+            self._rates = dict(zip(self._fusion.plan.sources, rates.tolist(), strict=True))
+        self._counted, self._counted_ns = counted, t_ns
+
+    def health(self, t_ns: int) -> dict[str, SourceHealth]:
+        fusion, present = self._fusion, self.present(t_ns)
+        beliefs = fusion.beliefs(t_ns)
+        clocks, nis, counts = fusion.clock.report(), nis_means(fusion), fusion.history.counts.tolist()
+        found = {}
+        for i, source in enumerate(fusion.plan.sources):
+            last = self._received.get(source)
+            found[source] = SourceHealth(
+                outcomes=OutcomeCounts(**{name: counts[i][outcome] for outcome, name in FIELDS.items()}),
+                present=source in present,
+                age_ms=None if last is None else (t_ns - last) / 1e6,
+                rate_hz=self._rates[source],
+                test_ratio=_last_ratio(fusion, i),
+                nis_mean=nis.get(source),
+                clock=_clock_health(self._clocks.get(source), clocks),
+                probabilities=Probabilities(**dict(zip(STATUSES, beliefs[source].probabilities, strict=True))),
+                status=cast(SourceStatus, beliefs[source].status),
+                reason=beliefs[source].reason or None,
+            )
+        return found
+
+
+class Changes:
+    """What changed from one tick to the next: mode, resets, sources that come and go."""
+
+    def __init__(self, config: Config, fusion: Fusion) -> None:
+        self.reset_reason: str | None = None
+        self._config, self._fusion = config, fusion
+        self._mode: Mode | None = None
+        self._resets = self._blown = 0
+        self._decided = False
+        self._started: int = NEVER
+        self._present: frozenset[str] = frozenset()
+        self._statuses = dict.fromkeys(fusion.plan.sources, "nominal")
+        self._look_ns: int = NEVER
+
+    def since(self, state: StateMessage, present: frozenset[str]) -> Iterator[EventMessage]:
+        """The events between the tick before and this one."""
+
+        def event(**fields: Any) -> EventMessage:
+            return EventMessage(vehicle=state.vehicle, t_ns=state.t_ns, **fields)
+
+        stamps = self._fusion.history.head.stamps
+        if state.resets != self._resets:
+            if state.resets > self._resets:
+                self.reset_reason = self._why()
+                yield event(kind="reset", severity="warning", subject="", text=f"state reset: {self.reset_reason}")
+            self._resets = state.resets
+        self._blown, self._started = int(stamps[BLOWN]), int(stamps[T_START])
+        self._decided = decided(self._fusion.history.head, self._fusion.plan)
+        if state.mode is not self._mode:
+            text = state.mode.value if self._mode is None else f"{self._mode.value} -> {state.mode.value}"
+            yield event(kind="mode", severity=SEVERITY[state.mode], subject=state.mode.value, text=f"mode: {text}")
+            self._mode = state.mode
+        for source in sorted(present - self._present):
+            yield event(kind="source_found", severity="info", subject=source, text=f"{source}: receiving")
+        for source in sorted(self._present - present):
+            text = f"{source}: nothing received for {ABSENT_NS / SECOND:g} s"
+            yield event(kind="source_lost", severity="warning", subject=source, text=text)
+        self._present = present
+        if state.t_ns >= self._look_ns:
+            self._look_ns = state.t_ns + LOOK_NS
+            for source, belief in self._fusion.beliefs(state.t_ns).items():
+                if belief.status not in ("absent", self._statuses[source]):  # that it is gone is told above
+                    self._statuses[source] = belief.status
+                    good = belief.status == "nominal"
+                    text = f"{source}: {belief.status}" + (f": {belief.reason}" if belief.reason else "")
+                    yield event(kind="source_status", severity="info" if good else "warning", subject=source, text=text)
+
+    def _why(self) -> str:
+        """Why the state was reset, as far as it can be seen from the state now."""
+        fusion, settings = self._fusion, self._config.filter
+        head = fusion.history.head
+        if decided(head, fusion.plan) and not self._decided:
+            return "the drive has decided on the heading, which was a stored one"
+        if head.stamps[BLOWN] > self._blown:
+            return "it was no longer finite; aligning anew"
+        if head.stamps[T_START] != self._started:
+            gap = f"more than {settings.restart_gap_s:g} s without data, or without the IMU until the heading was lost"
+            return f"{gap}; aligning anew"
+        believed = [name for i, name in enumerate(fusion.plan.sources) if head.memory[i, LAST_RATIO] > 1
+                    and head.source_stamps[i, T_REJECTED] == NEVER]  # fmt: skip
+        return f"{' and '.join(believed) or 'GNSS'} was rejected, off alike all the time, and is now believed again"
+
+
+def nis_means(fusion: Fusion) -> dict[str, float]:
+    """By source, over the horizon: the mean of the squared innovations per axis, in sigmas."""
+    rows = fusion.history.rows
+    axes = np.count_nonzero(rows["variance"] > 0, axis=1)
+    judged = (axes > 0) & np.isfinite(rows["ratio"])
+    squares = rows["ratio"][judged] * np.array(fusion.plan.gates)[axes[judged]] / axes[judged]
+    number = len(fusion.plan.sources)
+    counts = np.bincount(rows["source"][judged], minlength=number)
+    sums = np.bincount(rows["source"][judged], weights=squares, minlength=number)
+    return {name: float(sums[i] / counts[i]) for i, name in enumerate(fusion.plan.sources) if counts[i]}
+
+
+def _last_ratio(fusion: Fusion, source: int) -> float | None:
+    head = fusion.history.head
+    stamps = head.source_stamps[source]
+    ratio = float(head.memory[source, LAST_RATIO])
+    judged = stamps[T_FUSED] != NEVER or stamps[T_REJECTED] != NEVER
+    return ratio if judged and math.isfinite(ratio) else None
+
+
+def _clock_health(name: str | None, clocks: Mapping[str, ClockReport]) -> ClockHealth | None:
+    report = clocks.get(name or "arrival") if name is not None else None
+    if report is None:
+        return None
+    return ClockHealth(
+        name=name or "arrival",
+        method=report.method,
+        offset_ms=report.offset_ns / 1e6,
+        drift_ppm=report.drift_ppm,
+        jitter_ms=report.jitter_ns / 1e6,
+        resets=report.resets,
+        strays=report.strays,
+        note=report.note,
+    )
+
+
+# --- What does not change while it runs
+
+
+def key(vehicle: str, kind: str, source: str = "") -> str:
+    """Where a kind of message is published over Zenoh."""
+    return f"fusiond/{vehicle}/{kind}" + (f"/{source}" if source else "")
+
+
+def config_table(config: Config) -> dict[str, Any]:
+    """The configuration as a table of plain values, defaults filled in."""
+    table: dict[str, Any] = msgspec.to_builtins(config)
+    del table["directory"]
+    return table
+
+
+def info_message(config: Config, fusion: Fusion) -> InfoMessage:
+    """What is running here."""
+    vehicle, plan = config.vehicle.name, fusion.plan
+    kinds = ("imu" if model == IMU else MODELS[model].name for model in plan.models)
+    return InfoMessage(
+        vehicle=vehicle,
+        version=__version__,
+        kernel="numpy" if isinstance(fusion.history.kernel, Kernel) else "compiled",
+        encoding=config.publish.encoding,
+        schemas=dict.fromkeys(MESSAGES, SCHEMA_VERSION),
+        keys={kind: key(vehicle, kind, "*" if kind == "innovations" else "") for kind in MESSAGES},
+        sources=dict(zip(plan.sources, kinds, strict=True)),
+        config=config_table(config),
+    )
+
+
+def config_message(config: Config) -> ConfigMessage:
+    """The configuration in force."""
+    return ConfigMessage(vehicle=config.vehicle.name, config=config_table(config))

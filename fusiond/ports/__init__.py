@@ -1,0 +1,1 @@
+"""What an adapter implements: inputs, outputs, and the bounded boxes between their threads and the engine."""

@@ -1,0 +1,437 @@
+"""The state to the autopilot: what ArduPilot and PX4 make of it, what is never sent, and whether they use it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from fusiond.config.toml import ConfigError
+from fusiond.estimator.solution import Mode
+from fusiond.maths.rotation import euler, matrix, matrix_from_euler
+from fusiond.messages.types import State, StateMessage
+from fusiond_adapters.mavlink.autopilot import AutopilotOutput, Readback
+from fusiond_adapters.mavlink.outgoing import FORMS, Origin, Pace, ellipsoid_map, odometry, vision_position
+from fusiond_adapters.mavlink.transport import Whole
+from tests.helpers.live import configuration
+from tests.helpers.mavlink_peers import (
+    CLOCK,
+    COMPONENT,
+    MS,
+    SYSTEM,
+    ArduPilot,
+    Ear,
+    Peer,
+    Px4,
+    Recorder,
+    TcpPeer,
+    UdpPeer,
+    greeted,
+    link_to,
+    recent,
+    serving,
+    state_at,
+)
+
+ON = '[autopilot]\nlink = "fc"\nrate_hz = 25.0\n'
+AUTOPILOTS: dict[str, type[ArduPilot] | type[Px4]] = {"ardupilot": ArduPilot, "px4": Px4}
+
+
+@pytest.fixture(params=[UdpPeer, TcpPeer], ids=["udp", "tcp"])
+def peer(request: pytest.FixtureRequest) -> Iterator[Peer]:
+    made: Peer = request.param()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def udp() -> Iterator[UdpPeer]:
+    made = UdpPeer()
+    yield made
+    made.close()
+
+
+def told(state: StateMessage) -> State:
+    assert state.state is not None
+    return state.state
+
+
+def position_of(state: StateMessage) -> tuple[float, float, float]:
+    return told(state).lat_deg, told(state).lon_deg, told(state).height_m
+
+
+def diagonal(block: tuple[float, ...]) -> list[float]:
+    return [block[0], block[4], block[8]]
+
+
+# --- What they make of it
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@pytest.mark.parametrize("message", ["odometry", "vision_position"])
+def test_the_autopilot_gets_the_state(peer: Peer, kind: str, message: str, tmp_path: Path) -> None:
+    settings, link = link_to(peer, tmp_path, f'{ON}kind = "{kind}"\nmessage = "{message}"\n')
+    output = AutopilotOutput(settings, link, CLOCK.now_ns)
+    states = recent(8, resets=259)
+    ear = Ear(peer)
+    names = ("ODOMETRY", "VISION_POSITION_ESTIMATE")
+    maker = dialect.MAV_AUTOPILOT_PX4 if kind == "px4" else dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+    with serving(link, output):
+        greeted(ear, link, maker)
+        for state in states:
+            output.outbox.put(state)
+        ear.until(lambda: len(ear.of(*names)) == len(states))
+    sent = ear.of(*names)
+    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in sent} == {(SYSTEM, 191)}
+    autopilot = AUTOPILOTS[kind](position_of(states[0]))
+    for m, state in zip(sent, states, strict=True):
+        taken = autopilot.take(m)
+        assert taken is not None
+        want = told(state)
+        metre = 1e-5  # deg
+        assert taken.time_us == state.t_ns // 1000
+        assert taken.latitude_deg == pytest.approx(want.lat_deg, abs=1e-3 * metre)
+        assert taken.longitude_deg == pytest.approx(want.lon_deg, abs=1e-3 * metre)
+        assert taken.height_m == pytest.approx(want.height_m, abs=1e-5)
+        assert taken.quaternion is not None
+        assert abs(np.dot(taken.quaternion, want.quaternion_nb)) == pytest.approx(1, abs=1e-6)
+        assert taken.reset_counter == 259 % 256
+        if message == "odometry":
+            assert taken.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
+            assert 1 <= taken.quality <= 100
+        check_variances(taken.variances, want, kind)
+
+
+def check_variances(variances: tuple[float, ...], want: State, kind: str) -> None:
+    position = diagonal(want.covariance_position_m2)
+    if kind == "ardupilot":
+        assert variances[0] == pytest.approx(sum(position), rel=1e-5)
+        return
+    assert variances[:3] == pytest.approx(position, rel=1e-5)
+    if len(variances) > 6:
+        mat_bn = matrix(np.array(want.quaternion_nb)).T
+        velocity = np.array(want.covariance_velocity_m2ps2).reshape(3, 3)
+        assert variances[6:] == pytest.approx(np.diag(mat_bn @ velocity @ mat_bn.T), rel=1e-4)
+
+
+def test_what_pleases_one_autopilot_is_refused_by_the_other() -> None:
+    message = state_at(10**18, 3)
+    origin = Origin.of(told(message))
+    here = position_of(message)
+    to_px4, to_ardupilot = (odometry(message, told(message), origin, FORMS[kind], 50) for kind in ("px4", "ardupilot"))
+    ardupilot, px4 = ArduPilot(here), Px4(here)
+    assert ardupilot.take(to_px4) is None and ardupilot.dropped == 1
+    assert px4.take(to_ardupilot) is None and px4.refused == 1
+    to_px4.estimator_type = dialect.MAV_ESTIMATOR_TYPE_GPS_INS
+    assert px4.take(to_px4) is None
+    to_px4.estimator_type = dialect.MAV_ESTIMATOR_TYPE_NAIVE
+    naive = px4.take(to_px4)
+    assert naive is not None and naive.variances == ()
+    to_ardupilot.quality = -1
+    assert ardupilot.take(to_ardupilot) is None
+
+
+def test_gps_input(udp: UdpPeer, tmp_path: Path) -> None:
+    settings, link = link_to(udp, tmp_path, f'{ON}message = "gps_input"\ngps_id = 1\n')
+    settings = msgspec.structs.replace(settings, vehicle=msgspec.structs.replace(settings.vehicle, geoid_m=47.5))
+    output = AutopilotOutput(settings, link, CLOCK.now_ns)
+    states = recent(5)
+    ear = Ear(udp)
+    with serving(link, output):
+        greeted(ear, link)
+        for state in states:
+            output.outbox.put(state)
+        ear.until(lambda: len(ear.of("GPS_INPUT")) == len(states))
+    autopilot = ArduPilot(position_of(states[0]))
+    for m, state in zip(ear.of("GPS_INPUT"), states, strict=True):
+        taken = autopilot.take(m)
+        want = told(state)
+        assert m.gps_id == 1 and taken is not None and taken.quaternion is not None
+        assert (taken.latitude_deg, taken.longitude_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-7)
+        assert taken.height_m == pytest.approx(want.height_m - 47.5, abs=1e-4)
+        assert taken.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
+        yaw = math.degrees(euler(matrix(np.array(taken.quaternion)))[2])
+        assert math.remainder(yaw - want.yaw_deg, 360) == pytest.approx(0, abs=0.01)
+        assert taken.variances[:2] == pytest.approx(
+            (max(want.sigma_position_ned_m[:2]), want.sigma_position_ned_m[2]), rel=1e-5
+        )
+        gps_epoch_to_unix_us = (315_964_800 - 18) * 10**6
+        assert taken.time_us + gps_epoch_to_unix_us == pytest.approx(state.t_ns / 1000, abs=1000)
+
+
+# --- Numbers
+
+
+def test_angles_in_the_covariance_are_those_of_roll_pitch_and_yaw() -> None:
+    """Against finite differences of the Euler angles."""
+    message = state_at(10**18, 4)
+    state = told(message)
+    mat_nb = matrix(np.array(state.quaternion_nb))
+    step = 1e-6
+    columns = []
+    for axis in range(3):
+        turn = [step if axis == i else 0.0 for i in range(3)]
+        turned = euler(matrix_from_euler(*turn) @ mat_nb)
+        columns.append((np.array(turned) - np.array(euler(mat_nb))) / step)
+    jacobian = np.column_stack(columns)
+    want = jacobian @ np.array(state.covariance_attitude_rad2).reshape(3, 3) @ jacobian.T
+    covariance = vision_position(message, state, Origin.of(state), FORMS["px4"]).covariance
+    whole = np.zeros((6, 6))
+    whole[np.triu_indices(6)] = covariance
+    np.testing.assert_allclose(whole[3:, 3:][np.triu_indices(3)], want[np.triu_indices(3)], rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(whole[:3, :3], np.triu(np.array(state.covariance_position_m2).reshape(3, 3)))
+    assert not whole[:3, 3:].any()
+
+
+def test_maps_differ_by_metres_and_cross_the_date_line() -> None:
+    origin = Origin(48.0, 179.99, 0.0)
+    for on in (FORMS["ardupilot"].on, FORMS["px4"].on, ellipsoid_map):
+        north, east = on(origin, 48.05, -179.99)
+        assert north == pytest.approx(5560, abs=10) and east == pytest.approx(1490, abs=5)
+    apart = FORMS["ardupilot"].on(origin, 48.05, 179.99)[0] - ellipsoid_map(origin, 48.05, 179.99)[0]
+    assert 4 < apart < 8  # m, in 5.6 km
+
+
+def test_pace_keeps_its_rate_between_ticks_of_another() -> None:
+    pace = Pace(30.0)
+    passed = [pace.due(tick * 20 * MS) for tick in range(500)]  # 10 s at 50 Hz
+    assert sum(passed) == 300
+    assert pace.due(60_000 * MS)
+    assert not pace.due(60_001 * MS)  # a pause is not made up for
+    assert not any(Pace(0.0).due(tick) for tick in range(3))
+
+
+# --- What is never sent
+
+LIMITS = "position_sigma_m = 2.0\nvelocity_sigma_mps = 0.5\nyaw_sigma_deg = 5.0\nage_ms = 100.0\n"
+UNFIT: list[tuple[dict[str, Any], str]] = [
+    ({"mode": Mode.ALIGNING}, "aligning"),
+    ({"mode": Mode.LOST}, "lost"),
+    ({"age_ns": None}, "older than 100 ms"),
+    ({"age_ns": 150 * MS}, "older than 100 ms"),
+    ({"scale": 5.0}, "sigma"),
+    ({"scale": math.inf}, "covariance"),
+]
+
+
+@pytest.mark.parametrize(("changes", "reason"), UNFIT)
+def test_an_unfit_state_is_not_sent_and_it_is_said_once(
+    udp: UdpPeer, tmp_path: Path, changes: dict[str, Any], reason: str
+) -> None:
+    settings, link = link_to(udp, tmp_path, ON + LIMITS)
+    output = AutopilotOutput(settings, link, CLOCK.now_ns)
+    ear = Ear(udp)
+    with np.errstate(invalid="ignore"):
+        states = recent(6, **changes)
+    with serving(link, output):
+        greeted(ear, link)
+        for state in states:
+            output.outbox.put(state)
+        ear.until(lambda: output.counts()["not fit"] == len(states) and bool(ear.texts()))
+    assert not ear.of("ODOMETRY")
+    assert len(ear.texts()) == 1
+    assert ear.texts()[0].startswith("fusiond: not sent to the autopilot: ") and reason in ear.texts()[0]
+    assert output.notes()["sending"].startswith("no: ") and reason in output.notes()["sending"]
+
+
+def made(tmp_path: Path, more: str) -> tuple[AutopilotOutput, Any]:
+    settings = configuration(tmp_path, "udpin:127.0.0.1:1", more)
+    link: Any = Recorder(settings)
+    return AutopilotOutput(settings, link, lambda: 10**18), link
+
+
+def test_dead_reckoning_is_sent_only_if_wanted(tmp_path: Path) -> None:
+    for wanted in (True, False):
+        output, link = made(tmp_path, f"{ON}dead_reckoning = {str(wanted).lower()}\n")
+        output.offer(state_at(10**18, mode=Mode.DEAD_RECKONING))
+        assert ("ODOMETRY" in link.kinds()) is wanted
+
+
+def test_the_origin_is_that_of_the_first_fit_state(tmp_path: Path) -> None:
+    output, link = made(tmp_path, ON)
+    output.offer(state_at(10**18 - 400 * MS, 0, mode=Mode.LOST))
+    assert output.origin is None
+    for number in (1, 2, 3):
+        output.offer(state_at(10**18 - (4 - number) * 100 * MS, number, resets=number))
+    first, *_, last = [m for m in link.sent if m.get_type() == "ODOMETRY"]
+    assert (first.x, first.y, first.z) == (0, 0, 0)
+    assert last.z == pytest.approx(-6.5) and last.reset_counter == 3
+    assert output.origin == Origin.of(told(state_at(0, 1)))
+
+
+def test_a_state_that_waited_too_long_is_not_sent(tmp_path: Path) -> None:
+    output, link = made(tmp_path, ON)
+    output.offer(state_at(10**18 - 2000 * MS))
+    assert not link.sent and output.counts()["stale"] == 1
+
+
+def test_a_closed_link_is_counted_and_told(tmp_path: Path) -> None:
+    output, link = made(tmp_path, ON)
+    link.open = False
+    output.offer(state_at(10**18))
+    assert output.counts()["link closed or full"] == 1
+    assert output.notes()["sending"] == "no: the link is closed or full"
+
+
+def test_quality_falls_with_the_sigmas(tmp_path: Path) -> None:
+    output, link = made(tmp_path, ON)
+    for number, scale in enumerate((0.01, 1.0, 2.0)):
+        output.offer(state_at(10**18 - (3 - number) * 100 * MS, 0, scale=scale))
+    good, fair, poor = (m.quality for m in link.sent if m.get_type() == "ODOMETRY")
+    assert 98 <= good <= 100 and good > fair > poor >= 1
+
+
+def test_the_origin_is_set_until_the_autopilot_names_one(tmp_path: Path) -> None:
+    output, link = made(tmp_path, f"{ON}set_origin = true\n")
+    voice = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    heartbeat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GROUND_ROVER, 3, 0, 0, 4, 3)
+    link.talk.hear(bytes(heartbeat.pack(voice)), 0)
+    output.offer(state_at(10**18 - 900 * MS))
+    state = told(state_at(0))
+    set_to = link.sent[1]
+    assert set_to.get_type() == "SET_GPS_GLOBAL_ORIGIN" and set_to.target_system == SYSTEM
+    assert set_to.latitude == round(state.lat_deg * 1e7) and set_to.altitude == round(state.height_m * 1e3)
+    theirs = dialect.MAVLink_gps_global_origin_message(set_to.latitude + 10_000, set_to.longitude, set_to.altitude, 0)
+    output.readback.hear(bytes(theirs.pack(voice)), 0)
+    output.offer(state_at(10**18 + 3000 * MS))
+    assert link.kinds().count("SET_GPS_GLOBAL_ORIGIN") == 1
+    assert output.notes()["origin"] == "the autopilot's local frame begins 111.3 m from ours"
+
+
+# --- Does it use us?
+
+GOOD = 0x33F  # attitude, velocities, positions relative and absolute, predicted too
+
+
+def report(flags: int, ratio: float) -> Any:
+    return dialect.MAVLink_ekf_status_report_message(flags, 0.1, ratio, 0.2, 0.0, 0.0, 0.0)
+
+
+def px4_status(flags: int, ratio: float) -> Any:
+    return dialect.MAVLink_estimator_status_message(1, flags, 0.1, ratio, 0.2, math.nan, math.nan, math.nan, 1.0, 1.0)
+
+
+def text(what: str) -> Any:
+    return dialect.MAVLink_statustext_message(6, what.encode(), 0, 0)
+
+
+VERDICTS: list[tuple[str, list[Any], str]] = [
+    ("ardupilot", [], "unknown"),
+    ("ardupilot", [report(GOOD, 0.3)], "likely: it has a position, worst test ratio 0.30"),
+    ("ardupilot", [report(GOOD, 0.3), text("EKF3 IMU0 is using external nav data")], "yes"),
+    ("ardupilot", [text("EKF3 IMU0 is using external nav data"), report(GOOD, 1.4)], "no: it rejects"),
+    ("ardupilot", [report(GOOD, 0.3), text("EKF3 IMU0 stopped aiding")], "no: it said that it stopped aiding"),
+    ("ardupilot", [report(GOOD | 1024, 0.3)], "no: its estimator is not initialised"),
+    ("ardupilot", [report(0x87, 0.3)], "no: it assumes a constant position"),
+    ("ardupilot", [report(0x27, 0.3)], "no: it has no horizontal position"),
+    ("ardupilot", [dialect.MAVLink_heartbeat_message(10, 12, 0, 0, 4, 3)], "no: the autopilot says it is px4"),
+    ("px4", [px4_status(GOOD, 0.3)], "likely"),
+    ("px4", [px4_status(GOOD | 1024, 0.3)], "likely"),  # a GPS glitch is no matter of ours
+    ("px4", [px4_status(GOOD, 2.5)], "no: it rejects measurements, worst test ratio 2.50"),
+]
+
+
+@pytest.mark.parametrize(("kind", "messages", "verdict"), VERDICTS)
+def test_whether_the_autopilot_uses_us(tmp_path: Path, kind: str, messages: list[Any], verdict: str) -> None:
+    link: Any = Recorder(configuration(tmp_path, "udpin:127.0.0.1:1", ON))
+    link.talk.target = (SYSTEM, COMPONENT)
+    readback = Readback(link, kind)
+    voice = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    other = dialect.MAVLink(None, srcSystem=SYSTEM + 1, srcComponent=COMPONENT)
+    readback.hear(bytes(report(0, 9.0).pack(other)), 0)  # another vehicle's is not ours
+    for message in messages:
+        readback.hear(bytes(message.pack(voice)), 0)
+    assert readback.verdict(1000 * MS).startswith(verdict)
+    if verdict.startswith(("likely", "yes")):
+        assert readback.verdict(6000 * MS).startswith("unknown")
+
+
+def test_the_autopilot_is_asked_for_its_status_and_it_is_read_back(udp: UdpPeer, tmp_path: Path) -> None:
+    """On a link of the dialect `common`, to which EKF_STATUS_REPORT is unknown."""
+    settings, link = link_to(udp, tmp_path, ON)
+    output = AutopilotOutput(settings, link, CLOCK.now_ns)
+    ear = Ear(udp)
+    with serving(link, output):
+        greeted(ear, link)
+        ear.until(lambda: any(m.param1 == 193 for m in ear.of("COMMAND_LONG") if m.command == 511))
+        ear.say(report(GOOD, 0.25))
+        ear.say(text("EKF3 IMU0 is using external nav data"))
+        ear.heartbeat()
+        ear.until(lambda: output.notes()["used"].startswith("yes"))
+    assert not link.listeners
+
+
+# --- A peer that does not read
+
+
+def test_a_stalled_peer_delays_nobody_and_tears_no_frame(tmp_path: Path) -> None:
+    stalled = TcpPeer(buffer=4096)
+    _, link = link_to(stalled, tmp_path, ON)
+    ear = Ear(stalled)
+    message = odometry(state_at(0), told(state_at(0)), Origin.of(told(state_at(0))), FORMS["ardupilot"], 50)
+    with serving(link):
+        greeted(ear, link)
+        slowest, lost, tries = 0.0, 0, 0
+        while lost < 1000 and tries < 100_000:
+            began = time.monotonic()
+            lost += not link.send(message)
+            slowest = max(slowest, time.monotonic() - began)
+            tries += 1
+        assert lost == 1000
+        assert slowest < 0.2
+        ear.until(lambda: len(ear.of("ODOMETRY")) > 0)
+        link.send(message)  # the rest of the one that was half taken, then this one
+        ear.until(lambda: len(ear.of("ODOMETRY")) == tries - lost + 1 or link.send(message))
+    assert not ear.of("BAD_DATA")
+    stalled.close()
+
+
+def test_a_line_that_takes_parts_gets_whole_frames() -> None:
+    got, room = bytearray(), [0]
+
+    def write(data: bytes) -> int:
+        if room[0] == 0:
+            raise BlockingIOError
+        taken = min(room[0], len(data))
+        got.extend(data[:taken])
+        room[0] -= taken
+        return taken
+
+    line = Whole(write)
+    frames = [bytes([number]) * 10 for number in range(40)]
+    taken = []
+    for number, frame in enumerate(frames):
+        room[0] += number % 9
+        if line.put(frame):
+            taken.append(frame)
+    room[0] = 100
+    assert line.put(b"last")
+    assert bytes(got) == b"".join(taken) + b"last"
+    assert 5 < len(taken) < 30
+
+
+# --- Configuration
+
+
+@pytest.mark.parametrize(
+    ("more", "key"),
+    [
+        ('[autopilot]\nlink = "none"', "autopilot.link"),
+        (f"{ON}kind = 'px4'\nmessage = 'gps_input'", "autopilot.message"),
+        ('[autopilot]\nlink = "fc"\nrate_hz = 150.0', "autopilot.rate_hz"),
+        (f"{ON}message = 'gps_input'\ngps_id = 0", "autopilot.gps_id"),
+        (f"{ON}set_origin = true\nmessage = 'gps_input'", "autopilot.set_origin"),
+        ('[ground_station]\nlink = "none"', "ground_station.link"),
+        ('[ground_station]\nlink = "fc"\nconnection = "udpout:127.0.0.1:1"', "ground_station.connection"),
+    ],
+)
+def test_contradictions_are_refused(tmp_path: Path, more: str, key: str) -> None:
+    with pytest.raises(ConfigError, match=key):
+        configuration(tmp_path, "udpin:127.0.0.1:1", more)

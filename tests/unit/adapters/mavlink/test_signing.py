@@ -1,0 +1,140 @@
+"""MAVLink signing: frames signed and checked as pymavlink does, and a timestamp that never falls."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common
+
+from fusiond.config.load import load
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond_adapters.mavlink.signing import EPOCH_NS, MINUTE, TICK_NS, Signing
+from fusiond_adapters.mavlink.talk import SECOND, MavlinkTalk
+from tests.helpers.live import SYSTEM, Autopilot, configuration, parsed
+
+KEY = bytes(range(32))
+HOUR = 60 * MINUTE
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Config:
+    return signed(tmp_path)
+
+
+def signed(folder: Path, more: str = "", key: bytes = KEY) -> Config:
+    (folder / "key").write_bytes(key)
+    text = f'signing_key_file = "key"\nsigning_timestamp_file = "stamp"\n{more}\n[can.car]'
+    configuration(folder, "udpin:127.0.0.1:14550")
+    file = folder / "live.toml"
+    file.write_text(file.read_text().replace("[can.car]", text))
+    return load(file)
+
+
+def peer(key: bytes = KEY) -> common.MAVLink:
+    made = common.MAVLink(None, srcSystem=SYSTEM, srcComponent=1)
+    made.signing.secret_key = key
+    made.signing.sign_outgoing = True
+    made.signing.timestamp = (time.time_ns() - EPOCH_NS) // TICK_NS + HOUR
+    return made
+
+
+def heartbeat(sender: common.MAVLink) -> bytes:
+    return bytes(common.MAVLink_heartbeat_message(10, 3, 0, 0, 0, 3).pack(sender))
+
+
+def test_what_is_said_satisfies_pymavlink(settings: Config) -> None:
+    said = b"".join(MavlinkTalk(settings, "fc").say(second * SECOND, alive=True)[0] for second in range(3))
+    reader = common.MAVLink(None)
+    reader.signing.secret_key = KEY
+    assert [message.get_type() for message in reader.parse_buffer(said)] == ["HEARTBEAT"] * 3
+    stranger = common.MAVLink(None)
+    stranger.signing.secret_key = bytes(32)
+    stranger.robust_parsing = True
+    assert {message.get_type() for message in stranger.parse_buffer(said)} == {"BAD_DATA"}
+
+
+def test_what_is_heard_must_be_signed_newer_and_whole(settings: Config) -> None:
+    signing, sender = Signing(settings, "fc"), peer()
+    first, second = heartbeat(sender), heartbeat(sender)
+    assert signing.accepts(first)
+    assert signing.accepts(second)
+    assert not signing.accepts(first)  # played back
+    third = bytearray(heartbeat(sender))
+    third[12] ^= 1
+    assert not signing.accepts(bytes(third))
+    assert not signing.accepts(heartbeat(peer(bytes(32))))
+    assert not signing.accepts(Autopilot().heartbeat())
+    old = peer()
+    old.srcComponent, old.signing.timestamp = 2, old.signing.timestamp - 2 * HOUR
+    assert not signing.accepts(heartbeat(old))  # a stream that begins an hour ago
+    assert signing.counts == {"unsigned": 1, "wrongly signed": 4, "timestamp not kept": 0}
+
+
+def test_unsigned_frames_where_they_may_come(tmp_path: Path) -> None:
+    signing = Signing(signed(tmp_path, "accept_unsigned = true"), "fc")
+    assert signing.accepts(Autopilot().heartbeat())
+    assert signing.accepts(heartbeat(peer()))
+    assert not signing.accepts(heartbeat(peer(bytes(32))))
+    assert signing.counts["unsigned"] == 0
+
+
+def stamps(settings: Config, frames: int) -> list[int]:
+    talk = MavlinkTalk(settings, "fc")
+    said = [talk.say(second * SECOND, alive=True)[0] for second in range(frames)]
+    return [int.from_bytes(frame[-12:-6], "little") for frame in said]
+
+
+def test_timestamps_ascend_over_restarts_whatever_the_clock(settings: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = stamps(settings, 5)
+    for wall_s in (1_800_000_000, 1_700_000_000, 0):  # set back, and back
+        monkeypatch.setattr("time.time_ns", lambda wall_s=wall_s: wall_s * 10**9)
+        told += stamps(settings, 5)
+    assert all(b > a for a, b in pairwise(told))
+    assert not settings.path("stamp.new").exists()
+
+
+def test_the_disk_is_written_seldom_and_ahead(settings: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time_ns", lambda: 1_800_000_000 * 10**9)
+    (last,) = stamps(settings, 1)
+    kept = settings.path("stamp").read_text()
+    assert int(kept) == last + MINUTE
+    talk = MavlinkTalk(settings, "fc")
+    for second in range(50):
+        talk.say(second * SECOND, alive=True)
+    assert int(settings.path("stamp").read_text()) == int(kept) + 1 + MINUTE  # once more, by the restart
+
+
+def test_a_disk_that_fails_is_counted_and_stops_nothing(settings: Config) -> None:
+    talk = MavlinkTalk(settings, "fc")
+    assert talk.signing is not None
+    settings.path("stamp.new").mkdir()
+    assert len(parsed(talk.say(0, alive=True)[0])) == 1
+    assert talk.signing.counts["timestamp not kept"] == 1
+
+
+@pytest.mark.parametrize("key", [KEY.hex().encode(), KEY.hex().encode() + b"\n"])
+def test_a_key_in_hex_digits(tmp_path: Path, key: bytes) -> None:
+    assert Signing(signed(tmp_path, key=key), "fc").accepts(heartbeat(peer()))
+
+
+@pytest.mark.parametrize("key", [b"", b"secret", KEY + b"\0", b"zz" * 32])
+def test_no_key(tmp_path: Path, key: bytes) -> None:
+    with pytest.raises(ConfigError, match=r"signing_key_file: .*32 bytes, or 64 hex digits"):
+        Signing(signed(tmp_path, key=key), "fc")
+
+
+def test_what_is_missing_or_no_timestamp(settings: Config, tmp_path: Path) -> None:
+    settings.path("stamp").write_text("yesterday")
+    with pytest.raises(ConfigError, match=r"signing_timestamp_file: .*holds no timestamp"):
+        Signing(settings, "fc")
+    settings.path("key").unlink()
+    with pytest.raises(ConfigError, match=r"signing_key_file: .*cannot be read"):
+        Signing(settings, "fc")
+    text = (tmp_path / "live.toml").read_text().replace('signing_timestamp_file = "stamp"', "")
+    (tmp_path / "live.toml").write_text(text)
+    with pytest.raises(ConfigError, match="signing needs both"):
+        load(tmp_path / "live.toml")

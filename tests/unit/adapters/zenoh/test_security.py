@@ -1,0 +1,142 @@
+"""The sample configurations for TLS and access control: who has no certificate stays out, who has one does only its own."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+
+import pytest
+import zenoh
+
+from fusiond.app.client import Client, ClientError
+from fusiond.config.schema import Config, Vehicle, Zenoh
+from fusiond.messages.types import EventMessage
+from fusiond_adapters.zenoh.queries import Answers
+from fusiond_adapters.zenoh.session import ZenohPublisher, open_session, session_config
+from tests.helpers.paths import ROOT
+
+SAMPLES = ROOT / "configs" / "zenoh"
+DEADLINE = 15.0  # s
+PLACE = "/etc/fusiond/zenoh"
+
+pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes its certificates with openssl")
+
+
+def openssl(*arguments: object) -> None:
+    subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The samples, with certificates, in a folder of their own."""
+    folder = tmp_path_factory.mktemp("zenoh")
+    curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", 2)
+    openssl("req", "-x509", *curve, "-subj", "/CN=authority", "-keyout", folder / "ca.key", "-out", folder / "ca.pem")
+    for name in ("router", "rover", "reader"):
+        request, key, names = folder / f"{name}.csr", folder / f"{name}.key", folder / f"{name}.ext"
+        names.write_text("subjectAltName=IP:127.0.0.1\nbasicConstraints=CA:FALSE\n")
+        openssl("req", *curve[:-2], "-subj", f"/CN={name}", "-keyout", key, "-out", request)
+        openssl("x509", "-req", "-in", request, "-CA", folder / "ca.pem", "-CAkey", folder / "ca.key", "-CAcreateserial",
+                "-days", 2, "-extfile", names, "-out", folder / f"{name}.pem")  # fmt: skip
+    for sample in SAMPLES.glob("*.json5"):
+        (folder / sample.name).write_text(sample.read_text().replace(PLACE, str(folder)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def endpoint(samples: Path) -> Iterator[str]:
+    """The router of the sample, on a free port of loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    with zenoh.open(session_config(Zenoh(mode="router", listen=[address], config_file="router.json5"), samples)):
+        yield address
+
+
+@contextmanager
+def vehicle(samples: Path, endpoint: str, file: str = "vehicle.json5", name: str = "rover") -> Iterator[ZenohPublisher]:
+    section = Zenoh(mode="client", listen=[], connect=[endpoint], config_file=file)
+    answers = Answers(Config(vehicle=Vehicle(name=name)))
+    answers.keep(event("latest", name))
+    with (
+        open_session(section, samples) as session,
+        ZenohPublisher(session, name, "json") as publisher,
+        answers.declared(session),
+    ):
+        yield publisher
+
+
+def event(text: str, vehicle: str = "rover") -> EventMessage:
+    return EventMessage(vehicle=vehicle, t_ns=1, kind="mode", severity="info", subject="nominal", text=text)
+
+
+def test_a_reader_gets_what_its_vehicle_says(samples: Path, endpoint: str) -> None:
+    with (
+        vehicle(samples, endpoint) as publisher,
+        Client(endpoint, "rover", config_file=samples / "reader.json5") as client,
+    ):
+        assert client.alive() == {"rover"}
+        assert client.latest(EventMessage).text == "latest"
+        publisher.publish(event("before"))
+        heard = client.stream(EventMessage, timeout_s=DEADLINE)
+        assert next(heard).text == "before"  # from the publisher's memory
+        publisher.publish(event("after"))
+        assert next(heard).text == "after"
+
+
+def test_a_reader_cannot_speak_for_a_vehicle(samples: Path, endpoint: str) -> None:
+    """The vehicle's word comes; the forged one, which the router had before, does not."""
+    came = Event()
+    heard: list[str] = []
+
+    def listen(message: EventMessage) -> None:
+        heard.append(message.text)
+        if message.text == "true":
+            came.set()
+
+    with (
+        Client(endpoint, "*", config_file=samples / "reader.json5") as client,
+        client.subscribed(EventMessage, listen),
+        vehicle(samples, endpoint, "reader.json5") as forger,
+        vehicle(samples, endpoint, "vehicle.json5", "other") as foreign,
+        vehicle(samples, endpoint) as rover,
+    ):
+        forger.publish(event("forged"))
+        foreign.publish(event("of another", "other"))
+        for liar in (forger, foreign):  # an answer tells that the router has had what was sent before
+            assert list(liar._session.get("fusiond/x/info", timeout=1.0)) == []
+        rover.publish(event("true"))
+        assert came.wait(DEADLINE)
+        assert client.alive() == {"rover"}
+    assert heard == ["true"]
+
+
+def test_a_vehicle_cannot_read(samples: Path, endpoint: str) -> None:
+    with (
+        vehicle(samples, endpoint) as rover,
+        Client(endpoint, "rover", config_file=samples / "vehicle.json5", timeout_s=1.0) as spy,
+    ):
+        rover.publish(event("secret"))
+        with pytest.raises(ClientError, match="fusiond/rover/events: nobody answers"):
+            spy.latest(EventMessage)
+
+
+def test_nobody_gets_in_without_a_certificate(samples: Path, endpoint: str) -> None:
+    bare = samples / "bare.json5"
+    bare.write_text('{transport: {link: {tls: {root_ca_certificate: "%s"}}}}' % (samples / "ca.pem"))
+    with pytest.raises(ClientError, match="Unable to connect"):
+        Client(endpoint, "rover", config_file=bare)
+
+
+def test_a_router_of_another_authority_is_not_believed(samples: Path, endpoint: str, tmp_path: Path) -> None:
+    openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", "/CN=rogue",
+            "-days", 2, "-keyout", tmp_path / "ca.key", "-out", tmp_path / "ca.pem")  # fmt: skip
+    text = (samples / "reader.json5").read_text().replace(f"{samples}/ca.pem", str(tmp_path / "ca.pem"))
+    (tmp_path / "reader.json5").write_text(text)
+    with pytest.raises(ClientError, match="Unable to connect"):
+        Client(endpoint, "rover", config_file=tmp_path / "reader.json5")

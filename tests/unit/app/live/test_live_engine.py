@@ -1,0 +1,160 @@
+"""Ticks and frames of the live engine: a state goes out before the work on the other messages, and nothing else changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+from pymavlink.dialects.v20 import common
+
+from fusiond.app.live.daemon import Daemon
+from fusiond.app.live.live_engine import MOST_FRAMES, LiveEngine
+from fusiond.messages.types import Message, StateMessage
+from fusiond_adapters.logs.play import PlayedClock
+from tests.helpers.live import Autopilot, configuration
+
+BEGIN_NS, MS, STEP_MS = 1_760_000_000_000_000_000, 1_000_000, 3  # samples: between ticks of 10 ms, and now and then at one
+SAMPLES = 200
+
+
+class Rig:
+    """The engine of a daemon that does not run, on a clock that the test sets."""
+
+    def __init__(self, folder: Path, *, on_imu: bool = False) -> None:
+        self.clock = PlayedClock(BEGIN_NS, 1.0)
+        settings = configuration(folder, "udpin:127.0.0.1:0")
+        settings = replace(settings, publish=replace(settings.publish, on_imu=on_imu))
+        daemon = Daemon(settings, zenoh=False, clock=self.clock)
+        self.said: list[Message] = []
+        self.inputs = daemon.inputs
+        self.live = LiveEngine(daemon.config, self.clock.now_ns, self.said.append)
+        self._autopilot = Autopilot()
+
+    def receive(self, number: int) -> None:
+        """An inertial sample arrives."""
+        since_ns = number * STEP_MS * MS
+        rest = (*(0.0,) * 7, 0x3F, 0)
+        sample = common.MAVLink_highres_imu_message(since_ns // 1000 + 10**7, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, *rest)
+        self.clock.set(BEGIN_NS + since_ns)
+        self.inputs["mavlink.fc"].inbox.put(self.clock.now_ns(), self._autopilot.pack(sample))
+
+    def taken(self) -> int:
+        return int(self.live.engine.fusion.history.counts.sum())
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Rig:
+    return Rig(tmp_path)
+
+
+def test_the_state_goes_first_and_what_was_received_after_it_waits(rig: Rig) -> None:
+    rig.receive(0)  # and so the first tick, at which everything is told
+    assert not rig.live.step(rig.inputs, give_way=True)
+    assert [type(message) for message in rig.said] == [StateMessage]
+    assert rig.live.unfinished
+    rig.live.finish_tick()
+    assert len(rig.said) > 2
+    assert not rig.live.unfinished
+    for number in range(1, 4):  # at 3, 6 and 9 ms
+        rig.receive(number)
+        assert not rig.live.step(rig.inputs, give_way=True)
+    before, taken = len(rig.said), rig.taken()
+    rig.receive(4)  # at 12 ms, and so the tick at 10 ms before it
+    assert rig.live.step(rig.inputs, give_way=True)
+    assert [type(message) for message in rig.said[before:]] == [StateMessage]
+    assert rig.taken() == taken
+    assert not rig.live.step(rig.inputs, give_way=True)
+    assert rig.taken() == taken + 1
+
+
+def test_what_is_prepared_is_what_the_tick_tells(tmp_path: Path) -> None:
+    """Prepared after every sample, which is in vain where another comes before the tick: the same messages."""
+    found = []
+    for prepares in (False, True):
+        rig, made = Rig(tmp_path), 0
+        message = rig.live.engine.message
+
+        def counted(t_ns: int, message: Callable[[int], StateMessage] = message) -> StateMessage:
+            nonlocal made
+            made += 1
+            return message(t_ns)
+
+        rig.live.engine.message = counted  # type: ignore[method-assign]
+        for number in range(SAMPLES):
+            rig.receive(number)
+            rig.live.step(rig.inputs)
+            if prepares:
+                rig.live.engine.prepare()
+                rig.live.engine.prepare()  # which is not made twice
+        found.append((rig.said, made))
+    (plain, ticks), (prepared, times) = found
+    assert prepared == plain
+    assert ticks == SAMPLES * STEP_MS // 10
+    assert times == SAMPLES + SAMPLES // 10  # once after each sample, and at the ticks that come with one
+
+
+def test_a_tick_that_waited_for_a_sample_gives_way_too(tmp_path: Path) -> None:
+    """The tick of 10 ms comes with the sample at 12 ms; the two received meanwhile wait until its state is out."""
+    rig = Rig(tmp_path, on_imu=True)
+    for number in range(4):
+        rig.receive(number)
+        rig.live.step(rig.inputs, give_way=True)
+    rig.live.finish_tick()
+    before, taken = len(rig.said), rig.taken()
+    for number in (4, 5, 6):
+        rig.receive(number)
+    assert rig.live.step(rig.inputs, give_way=True)
+    (state,) = rig.said[before:]
+    assert isinstance(state, StateMessage)
+    assert state.t_ns == BEGIN_NS + 12 * MS
+    assert rig.taken() == taken + 1
+    assert not rig.live.step(rig.inputs, give_way=True)
+    assert rig.taken() == taken + 3
+
+
+def test_a_tick_that_waits_in_vain_is_made_after_half_a_period(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, on_imu=True)
+    rig.receive(0)
+    rig.live.step(rig.inputs)
+    for since_ms, states in ((10, 1), (14, 1), (15, 2), (24, 2), (25, 3)):
+        rig.clock.set(BEGIN_NS + since_ms * MS)
+        rig.live.step(rig.inputs)
+        assert sum(isinstance(message, StateMessage) for message in rig.said) == states
+
+
+@pytest.mark.parametrize("on_imu", [False, True])
+def test_giving_way_changes_no_message(tmp_path: Path, on_imu: bool) -> None:
+    found = []
+    for give_way in (False, True):
+        rig = Rig(tmp_path, on_imu=on_imu)
+        for number in range(SAMPLES):
+            rig.receive(number)
+            while rig.live.step(rig.inputs, give_way=give_way):
+                pass
+        rig.live.finish_tick()
+        found.append(rig.said)
+    assert sum(isinstance(message, StateMessage) for message in found[0]) == SAMPLES * STEP_MS // 10
+    assert found[0] == found[1]
+
+
+def test_a_stall_is_caught_up_with_every_tick(rig: Rig) -> None:
+    for number in range(SAMPLES):
+        rig.receive(number)
+    assert not rig.live.step(rig.inputs)
+    states = [message for message in rig.said if isinstance(message, StateMessage)]
+    assert [(state.t_ns - BEGIN_NS) // MS for state in states] == list(range(0, SAMPLES * STEP_MS, 10))
+    assert isinstance(rig.said[0], StateMessage)
+
+
+def test_a_flood_is_taken_in_parts(rig: Rig) -> None:
+    for number in range(2 * MOST_FRAMES + 10):
+        rig.receive(number)
+    for part in range(1, 3):
+        assert rig.live.step(rig.inputs)
+        assert rig.taken() == part * MOST_FRAMES
+    assert not rig.live.step(rig.inputs)
+    assert rig.taken() == 2 * MOST_FRAMES + 10
+    ticks = {message.t_ns for message in rig.said if isinstance(message, StateMessage)}
+    assert len(ticks) == -(-(2 * MOST_FRAMES + 10) * STEP_MS // 10)

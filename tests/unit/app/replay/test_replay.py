@@ -1,0 +1,347 @@
+"""Replay: when ticks are made and what they tell, what is withheld, and what the summary counts."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from fusiond.app.progress import line, shown
+from fusiond.app.replay.comparison import Errors, Truth, TruthRow, Window
+from fusiond.app.replay.replay import Pacer, Replay, Wants, Withheld, parse_interval, parse_withheld
+from fusiond.config import load as config
+from fusiond.config.schema import Config
+from fusiond.engine import Engine
+from fusiond.errors import UsageError
+from fusiond.estimator.fusion import Fusion, Receipt
+from fusiond.events import GnssPosition, ImuSample, Invalid, Received, WheelSpeed
+from fusiond.messages.types import OutcomeCounts, StateMessage, csv_row, state_message
+from fusiond.simulation.scenario import parse
+from fusiond_adapters.logs.merge import open_logs
+from fusiond_adapters.logs.write import write_drive
+
+MS = 1_000_000  # ns
+SECOND = 1000 * MS
+T0 = 1_700_000_000 * SECOND + 123_456_789
+RATE = 30.0  # Hz: its period is no whole number of nanoseconds
+DRIVE = """
+[[segment]]
+duration_s = 6
+[start]
+speed_mps = 9.0
+[gnss]
+delay_ms = 120.0
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short simulated drive."""
+    path = tmp_path_factory.mktemp("drive")
+    write_drive(parse(DRIVE), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def setup(folder: Path) -> Config:
+    return config.load(folder / "fusiond.toml")
+
+
+@pytest.fixture(scope="module")
+def events(folder: Path, setup: Config) -> list[Received]:
+    return list(open_logs([folder / "drive.tlog", folder / "drive.log"], setup))
+
+
+def imu(t_ns: int, sequence: int = 0) -> Received:
+    return Received("imu0", sequence, "", None, t_ns, ImuSample((0.0, 0.0, -9.8), (0.0, 0.0, 0.0)))
+
+
+def ticks_of(setup: Config, events: list[Received], rate_hz: float = RATE) -> tuple[Replay, list[int]]:
+    """Replay, and the instants of its ticks from the first event."""
+    instants: list[int] = []
+
+    def note(message: StateMessage, _: Errors | None) -> None:
+        instants.append(message.t_ns - events[0].t_receive_ns)
+
+    replay = Replay(setup, Wants(rate_hz, on_tick=[note]))
+    replay.run(events)
+    return replay, instants
+
+
+# --- Ticks
+
+
+def test_ticks_stand_on_an_exact_grid_from_the_first_receipt(setup: Config, events: list[Received]) -> None:
+    _, instants = ticks_of(setup, events)
+    span = events[-1].t_receive_ns - events[0].t_receive_ns
+    assert instants == [k * SECOND // 30 for k in range(len(instants))]
+    assert instants[-1] <= span < len(instants) * SECOND // 30
+
+
+def test_a_tick_comes_after_all_it_may_know_and_before_the_rest(setup: Config, events: list[Received]) -> None:
+    order: list[tuple[str, int]] = []
+
+    def tick(message: StateMessage, _: Errors | None) -> None:
+        order.append(("tick", message.t_ns))
+
+    def receipt(receipt: Receipt) -> None:
+        order.append(("event", receipt.measurement.t_receive_ns))
+
+    Replay(setup, Wants(RATE, on_tick=[tick], on_receipt=[receipt])).run(events)
+    assert {kind for kind, _ in order} == {"tick", "event"}
+    for (kind, t_ns), (next_kind, next_ns) in pairwise(order):
+        if kind == "tick":
+            assert next_ns > t_ns, "an event received by the tick came after it"
+        elif next_kind == "tick":
+            assert t_ns <= next_ns
+
+
+def test_an_event_received_at_the_very_tick_is_in_it(setup: Config) -> None:
+    _, instants = ticks_of(setup, [imu(T0), imu(T0 + 100 * MS, 1)], rate_hz=10.0)
+    assert instants == [0, 100 * MS]
+
+
+def test_a_tick_waits_for_an_inertial_sample_for_half_a_period(setup: Config) -> None:
+    """With `on_imu`, at 10 Hz. The tick at 0 takes the sample there; that at 100 ms the one at 130, not the fix before it;
+    that at 200 ms none, for the one at 260 comes too late; that at 300 ms the one at 300, that at 400 ms the one at 449."""
+    waiting = replace(setup, publish=replace(setup.publish, on_imu=True))
+    fix = Received("gps0.position", 0, "", None, T0 + 110 * MS, GnssPosition(0.8, 0.2, 500.0))
+    samples = [imu(T0 + t * MS, k) for k, t in enumerate((0, 90, 130, 140, 260, 300, 449, 460))]
+    events = sorted([*samples, fix], key=lambda event: event.t_receive_ns)
+    _, instants = ticks_of(waiting, events, rate_hz=10.0)
+    assert [t / MS for t in instants] == [0, 130, 250, 300, 449]
+
+
+def test_another_sensor_does_not_end_the_wait(setup: Config) -> None:
+    waiting = replace(setup, publish=replace(setup.publish, on_imu=True))
+    other = Received("imu1", 0, "", None, T0 + 110 * MS, ImuSample((0.0, 0.0, -9.8), (0.0, 0.0, 0.0)))
+    order: list[tuple[int, int]] = []
+    engine = Engine(waiting, 10.0, lambda since, _: order.append((since, engine.now_ns - T0)))
+    for event in (imu(T0), other, imu(T0 + 120 * MS, 1)):
+        engine.advance(event.t_receive_ns)
+        if event is not other:  # which this configuration does not know
+            engine.take(event)
+        engine.taken(event)
+    assert order == [(0, 0), (120 * MS, 120 * MS)]
+
+
+def test_a_tick_that_waited_tells_of_the_sample_that_it_waited_for(setup: Config, events: list[Received]) -> None:
+    """Which is no older than the simulated transport takes; without waiting it is up to 10 ms older."""
+    waiting, ages = replace(setup, publish=replace(setup.publish, on_imu=True)), {}
+    for settings in (setup, waiting):
+        found: list[float] = []
+
+        def tick(message: StateMessage, _: Errors | None, found: list[float] = found) -> None:
+            found.append(message.age_ms or 0.0)
+
+        Replay(settings, Wants(RATE, on_tick=[tick])).run(events)
+        ages[settings.publish.on_imu] = found[:-4]  # at the end there are only late fixes
+    assert max(ages[True]) < 2.5 < statistics.median(ages[False])
+
+
+def test_ticks_tell_what_a_live_fusion_would(setup: Config, events: list[Received]) -> None:
+    told: dict[int, str] = {}
+
+    def tick(message: StateMessage, _: Errors | None) -> None:
+        told[message.t_ns] = csv_row(message)
+
+    Replay(setup, Wants(RATE, on_tick=[tick])).run(events)
+    checked = list(told)[1::40]
+    live = Fusion(setup)
+    waiting = iter(events)
+    event = next(waiting)
+    for t_ns in checked:
+        while event.t_receive_ns <= t_ns:
+            live.receive(event)
+            event = next(waiting)
+        outcomes = OutcomeCounts(**{name.lower(): count for name, count in live.totals().items()})
+        assert told[t_ns] == csv_row(state_message(live.estimate_at(t_ns), setup.vehicle.name, outcomes))
+    assert told[checked[-1]].endswith("nominal")
+
+
+def test_a_receipt_that_runs_back_does_not_turn_time_back(setup: Config) -> None:
+    stamps = [0, 50 * MS, 20 * MS, 120 * MS]
+    replay, instants = ticks_of(setup, [imu(T0 + t, k) for k, t in enumerate(stamps)], rate_hz=20.0)
+    assert instants == [0, 50 * MS, 100 * MS]
+    assert replay.events == 4
+
+
+def test_ticks_stop_in_a_hole_and_go_on_upon_the_grid(setup: Config) -> None:
+    hole = 2 * 3600 * SECOND + 7 * MS
+    replay, instants = ticks_of(setup, [imu(T0), imu(T0 + hole, 1), imu(T0 + hole + SECOND, 2)], rate_hz=10.0)
+    before = [t for t in instants if t < hole]
+    after = [t for t in instants if t > hole]
+    assert before[-1] == 60 * SECOND - 100 * MS
+    assert after[0] == 2 * 3600 * SECOND + 100 * MS
+    assert len(after) == 10
+    summary = replay.summary("c.toml", {}, [])
+    assert summary.published is not None
+    assert summary.published.rows == len(instants)
+    assert summary.published.rows + summary.published.skipped == 10 * 2 * 3600 + 11
+
+
+def test_without_a_taker_there_are_no_ticks(setup: Config, events: list[Received]) -> None:
+    replay = Replay(setup, Wants(RATE))
+    replay.run(events)
+    summary = replay.summary("c.toml", {}, [])
+    assert summary.published is None
+    assert summary.dead_reckoning is None
+    assert summary.final.state is not None
+
+
+def test_pace_is_asked_before_every_event_and_tick(setup: Config) -> None:
+    asked: list[int] = []
+    replay = Replay(setup, Wants(10.0, pace=asked.append, on_tick=[lambda *_: None]))
+    replay.run([imu(T0), imu(T0 + 250 * MS, 1)])
+    assert asked == [0, 0, 100 * MS, 200 * MS, 250 * MS]
+
+
+def test_pacer_sleeps_only_when_ahead() -> None:
+    now, slept = [0], []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        now[0] += round(seconds * SECOND)
+
+    pace = Pacer(2.0, lambda: now[0], sleep)
+    pace(0)
+    pace(4 * SECOND)  # due after 2 s
+    now[0] += 5 * SECOND  # the work took longer than the drive
+    pace(6 * SECOND)
+    assert slept == [2.0]
+
+
+# --- Withholding
+
+
+def test_withheld_events_never_arrive_but_are_counted(setup: Config, events: list[Received]) -> None:
+    out = parse_withheld("gps0:2-4", setup)
+    assert out == Withheld(frozenset({"gps0.position", "gps0.velocity"}), 2 * SECOND, 4 * SECOND)
+    seen: list[Receipt] = []
+    replay = Replay(setup, Wants(RATE, [out], on_receipt=[seen.append]))
+    replay.run(events)
+    first = events[0].t_receive_ns
+    fixes = [event for event in events if event.source == "gps0.position"]
+    kept = [e for e in fixes if not 2 * SECOND <= e.t_receive_ns - first < 4 * SECOND]
+    arrived = [r.measurement.t_receive_ns for r in seen if r.measurement.source == "gps0.position"]
+    assert arrived == [event.t_receive_ns for event in kept]
+    source = replay.summary("c.toml", {}, []).sources["gps0.position"]
+    assert (source.withheld, source.events) == (len(fixes) - len(kept), len(fixes))
+    assert source.withheld == 10
+
+
+def test_the_ends_of_a_withheld_interval(setup: Config) -> None:
+    seen: list[Receipt] = []
+    wants = Wants(RATE, [parse_withheld("imu0:0.1-0.2", setup)], on_receipt=[seen.append])
+    Replay(setup, wants).run([imu(T0 + t * MS, t) for t in (0, 99, 100, 199, 200)])
+    assert [receipt.measurement.sequence for receipt in seen] == [0, 99, 200]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("gps9:1-2", "there is no source 'gps9'; configured: gps0, front_left"),
+        ("gps0", "give SOURCE:START-STOP"),
+        ("gps0:", "is no interval"),
+        ("gps0:5-5", "is no interval"),
+        ("gps0:9-5", "is no interval"),
+        ("gps0:-1-5", "is no interval"),
+        (":1-2", "there is no source ''"),
+    ],
+)
+def test_what_cannot_be_withheld(setup: Config, text: str, complaint: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_withheld(text, setup)
+    assert complaint in str(caught.value)
+
+
+def test_one_stream_of_a_receiver_can_be_withheld(setup: Config) -> None:
+    assert parse_withheld("gps0.velocity:0-1.5", setup).sources == {"gps0.velocity"}
+    assert parse_interval("12.5-22") == (12.5, 22.0)
+
+
+# --- Summary
+
+
+def test_summary_accounts_for_every_event(setup: Config, events: list[Received]) -> None:
+    replay = Replay(setup, Wants(RATE))
+    replay.run([*events, Received("imu0", 10**6, "", None, events[-1].t_receive_ns, Invalid("broken"))])
+    summary = replay.summary("c.toml", {"a.tlog": {"records": 1}}, ["odd"])
+    assert summary.events == len(events) + 1
+    assert sum(source.events for source in summary.sources.values()) + summary.clock_pairs == summary.events
+    assert summary.sources["imu0"].invalid_reasons == {"broken": 1}
+    assert (summary.config, summary.logs, summary.warnings) == ("c.toml", {"a.tlog": {"records": 1}}, ["odd"])
+    assert summary.span.seconds == pytest.approx(6.0, abs=0.2)
+    late = summary.sources["gps0.position"].latency_ms
+    assert late is not None
+    assert 100 < late.min <= late.p50 <= late.p90 <= late.p99 <= late.max < 200
+
+
+def test_latency_counts_the_configured_delay(setup: Config) -> None:
+    replay = Replay(setup, Wants(RATE))
+    replay.run([Received("rear_left", k, "", None, T0 + k * MS, WheelSpeed(1.0)) for k in range(10)])
+    late = replay.summary("c.toml", {}, []).sources["rear_left"].latency_ms
+    assert late is not None
+    assert late.min == late.p50 == late.max == setup.can[setup.wheel["rear_left"].bus].delay_ms
+
+
+def test_window_limits_the_comparison(setup: Config, events: list[Received]) -> None:
+    first = events[0].t_receive_ns
+    rows = [TruthRow(first + k * SECOND // 10, 48.137, 11.575, 560.0, 9.0, 0.0, 0.0) for k in range(60)]
+    replay = Replay(setup, Wants(10.0, truth=Truth(rows), window=Window(3.0, 5.0)))
+    replay.run(events)
+    found = replay.summary("c.toml", {}, []).truth
+    assert found is not None
+    assert (found.rows, found.start_s, found.stop_s) == (21, 3.0, 5.0)
+
+
+# --- Progress
+
+
+class Terminal:
+    """A text stream that says whether it is a terminal, and keeps what is written."""
+
+    def __init__(self, tty: bool) -> None:
+        self.tty = tty
+        self.text = ""
+
+    def isatty(self) -> bool:
+        return self.tty
+
+    def write(self, text: str) -> int:
+        self.text += text
+        return len(text)
+
+    def flush(self) -> None:
+        self.text += ""
+
+
+def test_progress_is_shown_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(0, 10**15, SECOND))
+    monkeypatch.setattr("fusiond.app.progress.time.monotonic_ns", lambda: next(clock))
+    for tty in (True, False):
+        stream = Terminal(tty)
+        items = list(shown(range(200), lambda: 0.5, lambda: 3 * SECOND, stream))  # type: ignore[arg-type]
+        assert items == list(range(200))
+        assert ("50 %  3 s of drive" in stream.text) is tty
+    assert Terminal(False).text == ""
+
+
+def test_progress_line_stays_within_its_bounds() -> None:
+    assert "100 %" in line(1.7, 10.0, 2.0)
+    assert line(0.0, 0.0, 0.0).startswith("[..")
+
+
+def test_progress_ends_its_line_when_the_work_breaks_off() -> None:
+    def broken() -> Iterator[int]:
+        yield 1
+        raise OSError("gone")
+
+    stream = Terminal(True)
+    with pytest.raises(OSError, match="gone"):
+        list(shown(broken(), lambda: 0.0, lambda: 0, stream))  # type: ignore[arg-type]
+    assert stream.text.endswith("\x1b[K")

@@ -1,0 +1,207 @@
+"""`fusiond top`: what it shows of messages, and the command itself, over real Zenoh and on a real terminal."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Event, Thread
+
+import msgspec
+import pytest
+
+from fusiond.__main__ import UNUSABLE, main
+from fusiond.app.top.terminal import ansi
+from fusiond.app.top.view import Line, View, plain, screen
+from fusiond.config.schema import Zenoh
+from fusiond.estimator.solution import Mode
+from fusiond.messages.types import EventMessage, HealthMessage, Message, OutputHealth, StateMessage
+from fusiond_adapters.zenoh.session import ZenohPublisher, open_session
+from tests.helpers.drive import messages, settings
+from tests.unit.adapters.zenoh.test_session import DEADLINE, free_port
+
+CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
+
+def view_of(*told: Message) -> View:
+    view = View()
+    for message in told:
+        view.take(message)
+    return view
+
+
+def texts(lines: list[Line]) -> list[str]:
+    return [plain(line) for line in lines]
+
+
+def until(mode: Mode) -> list[Message]:
+    """The messages up to the first health in a mode."""
+    told = list(messages())
+    last = next(i for i, m in enumerate(told) if isinstance(m, HealthMessage) and m.mode is mode and i > 100)
+    return told[: last + 1]
+
+
+def colour_of(lines: list[Line], text: str) -> str:
+    return next(span.colour for line in lines for span in line if text in span.text)
+
+
+# --- What is shown
+
+
+def test_state_sources_and_events() -> None:
+    told = until(Mode.DEAD_RECKONING)
+    state = [message for message in told if isinstance(message, StateMessage)][-1]
+    health = told[-1]
+    assert state.state is not None and isinstance(health, HealthMessage)
+    lines = screen(view_of(*told), 0.0, 200, 100)
+    text = "\n".join(texts(lines))
+    assert text.startswith("tested  dead reckoning")
+    assert f"{state.state.lat_deg:.7f} N" in text and f"{state.state.sigma_yaw_deg:.2f}" in text and " 50 Hz" in text
+    for source, found in health.sources.items():
+        (row,) = [line for line in texts(lines) if line.startswith(f"{source} ")]
+        assert row.split()[3:9] == [str(count) for count in msgspec.structs.astuple(found.outcomes)]
+    assert "mode: nominal -> dead_reckoning" in text and "up        0:00:0" in text
+    assert colour_of(lines, "dead reckoning") == colour_of(lines, "-> dead_reckoning") == "yellow"
+
+
+def test_before_anything_has_come() -> None:
+    assert texts(screen(View(), 1.0, 80, 24)) == ["no state yet"]
+    first = next(message for message in messages() if isinstance(message, StateMessage))
+    assert first.state is None
+    assert texts(screen(view_of(first), 0.0, 80, 24))[0].startswith("tested  aligning")
+
+
+def test_silence_faults_and_absent_sources_are_red() -> None:
+    health = [message for message in messages() if isinstance(message, HealthMessage)][-1]
+    state = [message for message in messages() if isinstance(message, StateMessage)][-1]
+    gone = msgspec.structs.replace(health.sources["rear_left"], present=False)
+    health = msgspec.structs.replace(health, sources=health.sources | {"rear_left": gone})
+    state = msgspec.structs.replace(state, fault="height_m: not finite", state=None, mode=Mode.LOST)
+    lines = screen(view_of(state, health), 7.0, 200, 100)
+    for text in ("no state for 7 s", "state withheld: height_m: not finite", "nothing comes"):
+        assert colour_of(lines, text) == "red"
+
+
+def test_what_should_not_grow_is_yellow_while_it_does() -> None:
+    health = [message for message in messages() if isinstance(message, HealthMessage)][-1]
+
+    def rejected(count: int) -> HealthMessage:
+        outcomes = msgspec.structs.replace(health.sources["rear_left"].outcomes, rejected=count)
+        source = msgspec.structs.replace(health.sources["rear_left"], outcomes=outcomes)
+        return msgspec.structs.replace(health, sources={"rear_left": source})
+
+    assert colour_of(screen(view_of(rejected(770), rejected(777)), 0, 200, 100), "777") == "yellow"
+    assert colour_of(screen(view_of(rejected(777), rejected(777)), 0, 200, 100), "777") == "plain"
+
+
+def test_outputs_and_their_losses() -> None:
+    health = next(message for message in messages() if isinstance(message, HealthMessage))
+    outputs = {"zenoh": OutputHealth(offered=50, dropped=8, counts={}, notes={"session": "1 routers, 0 peers connected"})}
+    lines = screen(view_of(msgspec.structs.replace(health, outputs=outputs)), 0, 200, 100)
+    assert colour_of(lines, "8") == "yellow" and "zenoh" in "\n".join(texts(lines))
+
+
+@pytest.mark.parametrize(("width", "height"), [(10, 5), (60, 12), (80, 24), (300, 100)])
+def test_it_fits_any_terminal(width: int, height: int) -> None:
+    lines = screen(view_of(*messages()), 0.0, width, height)
+    assert len(lines) <= height and all(len(plain(line)) <= width for line in lines)
+    assert plain(lines[-1]).startswith("... ") == (height < 100)
+
+
+def test_no_message_steers_the_terminal() -> None:
+    event = next(message for message in messages() if isinstance(message, EventMessage))
+    lines = screen(view_of(msgspec.structs.replace(event, text="\x1b[2J\x07\n")), 0.0, 80, 24)
+    assert plain(lines[-1]).endswith("?[2J??")
+    assert ansi(lines[-1]).count("\x1b[") == 2 * len(lines[-1])
+
+
+# --- The command
+
+
+@contextmanager
+def published(vehicle: str = "tested") -> Iterator[int]:
+    """A vehicle that is dead reckoning, told again and again over Zenoh; its port."""
+    told = until(Mode.DEAD_RECKONING)
+    again = [message for message in told if isinstance(message, StateMessage)][-1], told[-1]
+    port, stop = free_port(), Event()
+    with (
+        open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
+        ZenohPublisher(session, vehicle, "json") as publisher,
+    ):
+
+        def publish() -> None:
+            while not stop.wait(0.02):
+                for message in again:
+                    publisher.publish(message)
+
+        thread = Thread(target=publish)
+        thread.start()
+        try:
+            yield port
+        finally:
+            stop.set()
+            thread.join(DEADLINE)
+
+
+def test_once_prints_a_screen(capsys: pytest.CaptureFixture[str]) -> None:
+    assert settings().vehicle.name == "tested"
+    with published() as port:
+        assert main(["top", "--connect", f"tcp/127.0.0.1:{port}", "--once"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("tested  dead reckoning") and "\x1b" not in out and "gps0.position" in out
+
+
+def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["top", "--connect", f"tcp/127.0.0.1:{free_port()}", "--once"]) == UNUSABLE
+    assert "Unable to connect" in capsys.readouterr().err
+    port = free_port()
+    with open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])):
+        assert main(["top", "--connect", f"tcp/127.0.0.1:{port}"]) == UNUSABLE
+    assert "no fusiond is running there" in capsys.readouterr().err
+
+
+def test_several_vehicles_have_to_be_chosen_from(capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_port()
+    with (
+        open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
+        ZenohPublisher(session, "one", "json"),
+        ZenohPublisher(session, "two", "json"),
+    ):
+        assert main(["top", "--connect", f"tcp/127.0.0.1:{port}"]) == UNUSABLE
+    assert "choose one by --vehicle: one, two" in capsys.readouterr().err
+
+
+def test_a_terminal_gets_it_redrawn_until_q() -> None:
+    with published() as port:
+        ours, theirs = pty.openpty()
+        command = [sys.executable, "-m", "fusiond", "top", "--connect", f"tcp/127.0.0.1:{port}", "--vehicle", "tested"]
+        environment = os.environ | {"COLUMNS": "120", "LINES": "40"}
+        process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=subprocess.PIPE, env=environment)
+        os.close(theirs)
+        try:
+            seen = received(ours, "dead reckoning") + received(ours, "rear_right")
+            os.write(ours, b"q")
+            rest = received(ours, "\x1b[?1049l")  # the terminal's own screen again
+            assert process.wait(DEADLINE) == 0
+        finally:
+            process.kill()
+            process.communicate()
+            os.close(ours)
+    assert seen.startswith("\x1b[?1049h") and "\x1b[33m" in seen and rest.endswith("\x1b[?25h\x1b[?1049l")
+    assert "tested  dead reckoning" in CODES.sub("", seen)
+
+
+def received(terminal: int, text: str) -> str:
+    """What a terminal is sent until a text is in it."""
+    seen, until_s = "", time.monotonic() + DEADLINE
+    while text not in seen and time.monotonic() < until_s:
+        if select.select([terminal], [], [], 0.2)[0]:
+            seen += os.read(terminal, 65536).decode("utf-8", "replace")
+    assert text in seen, seen
+    return seen

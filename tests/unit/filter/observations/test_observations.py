@@ -1,0 +1,266 @@
+"""Every observation model of the table: its Jacobian against finite differences, its innovation against what is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from fusiond.config.schema import Barometer, Gnss, Motion, Wheel
+from fusiond.events import GnssPosition, GnssVelocity, Pressure, WheelSpeed
+from fusiond.filter.measurement_update import inject
+from fusiond.filter.observations import (
+    CONSTRAINTS,
+    MODELS,
+    barometric_height,
+    gnss_position,
+    gnss_velocity,
+    non_holonomic,
+    wheel_speed,
+    zero_rotation,
+    zero_velocity,
+)
+from fusiond.filter.observations.model import LEVER_ARM_B, PARAMETERS, VALUES, mat_eb, mat_vb, rate_b
+from fusiond.filter.observations.wheel_speed import direction
+from fusiond.filter.state import (
+    GYRO_BIAS_B,
+    MEAN_RATE_B,
+    MOUNT,
+    POSITION_E,
+    QUATERNION_EB,
+    RATE_B,
+    SMOOTH_FORCE_B,
+    VELOCITY_E,
+    WHEEL_SCALE,
+    WIDE_SIZE,
+    FilterState,
+)
+from fusiond.maths.rotation import matrix_from_euler, quaternion
+from fusiond.maths.wgs84 import Array, ecef, mat_ne
+from tests.helpers.streams import EARTH_RATE_E, MUNICH, running_state
+
+GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
+WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
+MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])
+BAROMETER = Barometer(link="l")
+LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
+
+
+class Case(NamedTuple):
+    model: str
+    values: tuple[float, ...]
+    parameters: Array
+    speed: float  # m/s, of the vehicle, forward
+
+
+def wheel_case(speed: float, reading: float, **changes: bool) -> Case:
+    wheel = msgspec.structs.replace(WHEEL, **changes)
+    return Case("wheel_speed", wheel_speed.values(WheelSpeed(reading), wheel), wheel_speed.parameters(wheel), speed)
+
+
+FIX = GnssPosition(*MUNICH, 1.0, 2.0)
+CASES = {
+    "position": Case("gnss_position", gnss_position.values(FIX, GNSS), gnss_position.parameters(GNSS), 10.0),
+    "velocity": Case(
+        "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0, 1.0), GNSS), gnss_velocity.parameters(GNSS), 10.0
+    ),
+    "velocity 2-D": Case(
+        "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0), GNSS), gnss_velocity.parameters(GNSS), 10.0
+    ),
+    "position, learning": Case("gnss_position", gnss_position.values(FIX, LEARNT), gnss_position.parameters(LEARNT), 10.0),
+    "velocity, learning": Case(
+        "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0, 1.0), LEARNT), gnss_velocity.parameters(LEARNT), 10.0
+    ),
+    "velocity 2-D, learning": Case(
+        "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0), LEARNT), gnss_velocity.parameters(LEARNT), 10.0
+    ),
+    "barometer": Case(
+        "barometric_height",
+        barometric_height.values(Pressure(95_000.0, 280.0), BAROMETER),
+        barometric_height.parameters(BAROMETER),
+        10.0,
+    ),
+    "wheel signed": wheel_case(10.0, 10.0, unsigned=False),
+    "wheel signed in reverse": wheel_case(-3.0, -3.1, unsigned=False),
+    "wheel signed at rest": wheel_case(0.0, 0.0, unsigned=False),
+    "wheel unsigned": wheel_case(10.0, 10.0),
+    "wheel unsigned in reverse": wheel_case(-10.0, 10.0),
+    "wheel unsigned reading zero": wheel_case(0.5, 0.0),
+    "steered": wheel_case(10.0, 10.0, steered=True, unsigned=False),
+    "steered in reverse": wheel_case(-10.0, 10.0, steered=True),
+    "steered and slow": wheel_case(0.05, 0.0, steered=True),
+    "non-holonomic": Case("non_holonomic", (), non_holonomic.parameters(MOTION), 10.0),
+    "non-holonomic in reverse": Case("non_holonomic", (), non_holonomic.parameters(MOTION), -4.0),
+    "zero velocity": Case("zero_velocity", (), zero_velocity.parameters(MOTION), 0.2),
+    "zero rotation": Case("zero_rotation", (), zero_rotation.parameters(MOTION), 0.0),
+}
+
+
+def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
+    """A state that moves forward along its own axis, with a little of everything else."""
+    state = running_state(rng, size=WIDE_SIZE)
+    slip = 0.1 if abs(speed) > 1 else 0.01
+    state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
+    state.auxiliary[SMOOTH_FORCE_B] = rng.normal((0.0, 0.0, -9.8), 0.5)
+    state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
+    return state
+
+
+def test_every_model_has_a_case() -> None:
+    assert {case.model for case in CASES.values()} == {model.name for model in MODELS}
+    assert all(model.table is None for model in CONSTRAINTS)
+
+
+def predicted(observe: Callable[..., object], state: FilterState, row: Array, parameters: Array) -> Array:
+    """h(x): what a reading of zero would miss by."""
+    seen = observe(state, row, parameters)
+    assert seen is not None
+    return -seen.innovation  # type: ignore[attr-defined,no-any-return]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_jacobian_against_finite_differences(case: Case, seed: int) -> None:
+    """d h / d error = - d innovation / d error, for a direct measurement at a fixed reading."""
+    state = moving_state(np.random.default_rng(seed), case.speed)
+    observe = next(model.observe for model in MODELS if model.name == case.model)
+    row = np.zeros(VALUES)
+    row[: len(case.values)] = case.values
+    seen = observe(state, row, case.parameters)
+    assert seen is not None
+    m = len(seen.innovation)
+    assert (seen.jacobian.shape, seen.variance.shape) == ((m, state.size), (m,))
+    assert (seen.variance > 0).all()
+    scale = np.abs(seen.jacobian).max()
+    # the position innovation is resolved in axes that turn with the position: along the ground by 1 m in 6,400 km
+    atol = 1e-6 * max(scale, np.abs(seen.innovation).max())
+    for i, step in enumerate(STEPS):
+        ends = []
+        for sign in (1, -1):
+            moved, error = state.copy(), np.zeros(state.size)
+            error[i] = sign * step
+            inject(moved, error)
+            ends.append(predicted(observe, moved, row, case.parameters))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(seen.jacobian[:, i], slope, rtol=2e-5, atol=atol, err_msg=f"error {i}")
+
+
+def level_state(yaw: float = 0.4) -> FilterState:
+    state = FilterState(7)
+    state.nominal[POSITION_E] = ecef(*MUNICH)
+    state.nominal[QUATERNION_EB] = quaternion(mat_ne(ecef(*MUNICH)).T @ matrix_from_euler(0.0, 0.0, yaw))
+    return state
+
+
+def padded(values: tuple[float, ...]) -> Array:
+    return np.array(values + (0.0,) * (VALUES - len(values)))
+
+
+def test_position_of_the_antenna() -> None:
+    state = level_state(math.pi / 2)  # facing east: the antenna is 0.4 m west, 0.3 m south, 1.2 m above
+    place = ecef(*MUNICH) + mat_ne(ecef(*MUNICH)).T @ np.array([-0.3, -0.4, -1.2])
+    row = np.array([*place, 1.0, 4.0, 0.0, 0.0, 0.0])
+    seen = gnss_position.observe(state, row, gnss_position.parameters(GNSS))
+    np.testing.assert_allclose(seen.innovation, 0.0, atol=3e-9)
+    np.testing.assert_array_equal(seen.variance, [1.0, 1.0, 4.0])
+
+
+def test_velocity_of_the_antenna() -> None:
+    state = level_state(0.0)
+    state.nominal[GYRO_BIAS_B] = (0.0, 0.0, 0.1)
+    state.auxiliary[RATE_B] = (0.0, 0.0, 0.6)  # turns right by 0.5 rad/s
+    row = padded(gnss_velocity.values(GnssVelocity(-0.15, -0.2, 0.0), GNSS))
+    seen = gnss_velocity.observe(state, row, gnss_velocity.parameters(GNSS))
+    np.testing.assert_allclose(seen.innovation, 0.0, atol=1e-9)
+
+
+def test_sigmas_of_the_receiver_count_from_the_configured_on() -> None:
+    gnss = Gnss(link="l", position_sigma_m=1.0, height_sigma_m=2.0, velocity_sigma_mps=0.1)
+    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0), gnss)[3:] == (1.0, 4.0)
+    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0, 3.0, 5.0), gnss)[3:] == (9.0, 25.0)
+    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0, 0.5, 0.0), gnss)[3:] == (1.0, 4.0)
+    assert gnss_velocity.values(GnssVelocity(1.0, 2.0, 3.0, 0.5), gnss) == (1.0, 2.0, 3.0, 0.25, 3.0)
+    assert gnss_velocity.values(GnssVelocity(1.0, 2.0), gnss) == (1.0, 2.0, 0.0, 0.1 * 0.1, 2.0)
+
+
+def test_wheel_reads_its_contact_point_with_the_scale() -> None:
+    state = level_state(0.0)
+    state.nominal[VELOCITY_E] = mat_eb(state) @ [10.0, 0.0, 0.0]
+    state.nominal[WHEEL_SCALE] = 0.02
+    state.auxiliary[RATE_B] = (0.0, 0.0, 0.5)  # turning right: the left wheel is the outer one
+    row = padded((1.02 * (10.0 + 0.5 * 0.8), 0.01))
+    seen = wheel_speed.observe(state, row, wheel_speed.parameters(WHEEL))
+    assert seen.innovation[0] == pytest.approx(0.0, abs=1e-12)
+    steered = msgspec.structs.replace(WHEEL, steered=True)
+    along = math.hypot(10.4, 0.5 * 1.3)
+    seen = wheel_speed.observe(state, padded((1.02 * along, 0.01)), wheel_speed.parameters(steered))
+    assert seen.innovation[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_wheel_values() -> None:
+    wheel = Wheel(bus="b", message="m", signal="s", sigma_mps=0.1, quantum_mps=0.6, least_mps=0.3, correlation_s=0.2)
+    speed, variance, alike = wheel_speed.values(WheelSpeed(5.0), wheel)
+    assert (speed, variance, alike) == (5.0, pytest.approx(0.01 + 0.03), 0.2)
+    speed, variance, alike = wheel_speed.values(WheelSpeed(0.0), wheel)
+    assert (speed, variance, alike) == (0.0, pytest.approx(0.04 + 0.03), wheel_speed.SLOW_ALIKE)
+
+
+def test_sign_of_an_unsigned_wheel() -> None:
+    unsigned = wheel_speed.parameters(WHEEL)
+    signed = wheel_speed.parameters(msgspec.structs.replace(WHEEL, unsigned=False))
+    row = padded((5.0, 0.01, 0.0))
+    for speed, parameters, expected in ((-5.0, unsigned, 0.0), (-5.0, signed, 10.0), (5.0, unsigned, 0.0)):
+        state = level_state()
+        state.nominal[VELOCITY_E] = mat_eb(state) @ [speed, 0.0, 0.0]
+        seen = wheel_speed.observe(state, row, parameters)
+        assert seen.innovation[0] == pytest.approx(expected, abs=1e-12)
+        assert seen.variance[0] == 0.01
+
+
+def test_slow_unsigned_wheel_is_a_mixture_of_two_directions() -> None:
+    """The mean sign is that of two Gaussians of speeds +-z, weighed by what a speed of N(h, S - R) makes of each."""
+    z, h, spread = 0.8, 0.3, 0.5
+    forward, backward = (math.exp(-((sign * z - h) ** 2) / (2 * spread)) for sign in (1, -1))
+    assert direction(z * h / spread) == pytest.approx((forward - backward) / (forward + backward))
+    assert (direction(0.0), direction(1e9), direction(-1e9)) == (0.0, 1.0, -1.0)
+    state = level_state()
+    state.covariance[3:6, 3:6] = np.eye(3)
+    still = wheel_speed.observe(state, padded((z, 0.01, 0.0)), wheel_speed.parameters(WHEEL))
+    assert still.innovation[0] == pytest.approx(0.0, abs=1e-12)  # no direction, so no push either way
+    assert still.variance[0] == pytest.approx(0.01 + wheel_speed.DIRECTION_ALIKE * z * z)
+
+
+def test_non_holonomic_rests_when_slow() -> None:
+    state, parameters = level_state(), non_holonomic.parameters(Motion(minimum_speed_mps=2.0))
+    for speed, rests in ((1.99, True), (-1.99, True), (2.01, False), (-2.01, False)):
+        state.nominal[VELOCITY_E] = mat_eb(state) @ [speed, 0.0, 0.0]
+        assert (non_holonomic.observe(state, parameters, parameters) is None) is rests
+
+
+def test_non_holonomic_takes_the_mount_out() -> None:
+    state, parameters = level_state(), non_holonomic.parameters(Motion())
+    pitch, yaw = 0.03, -0.02
+    state.nominal[MOUNT] = pitch, yaw
+    state.nominal[VELOCITY_E] = mat_eb(state) @ (mat_vb(pitch, yaw)[0].T @ [12.0, 0.0, 0.0])
+    seen = non_holonomic.observe(state, parameters, parameters)
+    assert seen is not None
+    np.testing.assert_allclose(seen.innovation, 0.0, atol=1e-12)
+
+
+def test_zero_rotation_allows_for_the_earth() -> None:
+    state, parameters = level_state(), zero_rotation.parameters(Motion())
+    state.nominal[GYRO_BIAS_B] = (0.01, -0.02, 0.03)
+    state.auxiliary[RATE_B] = state.nominal[GYRO_BIAS_B] + mat_eb(state).T @ EARTH_RATE_E
+    np.testing.assert_allclose(zero_rotation.observe(state, parameters, parameters).innovation, 0.0, atol=1e-16)
+    np.testing.assert_allclose(rate_b(state), mat_eb(state).T @ EARTH_RATE_E, atol=1e-16)
+
+
+def test_parameters_fit_their_row() -> None:
+    rows = [gnss_position.parameters(GNSS), wheel_speed.parameters(WHEEL), non_holonomic.parameters(MOTION)]
+    assert all(row.shape == (PARAMETERS,) for row in rows)
+    np.testing.assert_array_equal(rows[0][LEVER_ARM_B], GNSS.lever_arm_m)

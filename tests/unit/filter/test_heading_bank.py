@@ -1,0 +1,118 @@
+"""The bank of heading hypotheses: it finds the heading from every start, honestly, and twin and kernel agree on it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fusiond.estimator.fusion import Fusion
+from fusiond.estimator.solution import Mode
+from fusiond.events import GnssVelocity, Measurement
+from fusiond.filter.heading_bank import alive, difference, normalise
+from fusiond.filter.measurement_update import inject
+from fusiond.filter.state import ATTITUDE, CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
+from fusiond.maths.wgs84 import Array, mat_ne
+from tests.conftest import needs_compiled
+from tests.helpers.streams import SECOND, T0, Drive, config, drive, fuse, measurements, running_state
+
+PULLS_AWAY_S = 3.0
+
+
+def ramp(t: Array, begin: float, length: float) -> Array:
+    u = np.clip((t - begin) / length, 0.0, 1.0)
+    return u * u * (3 - 2 * u)
+
+
+def departing(heading: float, speed: float = 6.0, seconds: float = 13.0) -> Drive:
+    """Stands, pulls away after 3 s, forward or in reverse, and weaves a little."""
+    return drive(
+        seconds,
+        lambda t: speed * ramp(t, PULLS_AWAY_S, 4.0),
+        lambda t: heading + 0.2 * np.sin(0.5 * t) * ramp(t, PULLS_AWAY_S, 3.0),
+        rate=50.0,
+    )
+
+
+def yaw_error(fusion: Fusion, truth: Drive) -> tuple[float, float]:
+    """Error of the published yaw at the end of a drive, and its sigma [rad]."""
+    estimate = fusion.estimate_at(T0 + round(truth.seconds[-1] * SECOND)).state
+    assert estimate is not None, "there is a state at the end"
+    forward_n = mat_ne(truth.position_e[-1]) @ truth.mat_eb[-1][:, 0]
+    off = estimate.euler()[2] - math.atan2(forward_n[1], forward_n[0])
+    return (off + math.pi) % (2 * math.pi) - math.pi, estimate.sigma_yaw()
+
+
+@needs_compiled
+@pytest.mark.parametrize("start_deg", range(0, 360, 15))
+def test_the_heading_is_found_within_ten_seconds(start_deg: int) -> None:
+    truth = departing(math.radians(start_deg))
+    fusion = fuse(config(), measurements(truth, seed=start_deg + 1), True)
+    error, sigma = yaw_error(fusion, truth)
+    assert abs(error) < math.radians(5.0)
+    assert abs(error) < 3 * sigma
+
+
+@needs_compiled
+@pytest.mark.parametrize("seed", range(6))
+def test_in_reverse_with_wheels_that_do_not_tell(seed: int) -> None:
+    """Only the inertial sensor knows: what feels as braking is speeding up backwards."""
+    truth = departing(1.0 + seed, speed=-3.0)
+    error, sigma = yaw_error(fuse(config(), measurements(truth, seed=seed + 1), True), truth)
+    assert abs(error) < math.radians(5.0)
+    assert abs(error) < 3 * sigma
+
+
+def test_at_rest_it_waits_and_then_runs(compiled: bool) -> None:
+    truth = departing(2.0, seconds=6.0)
+    fusion, phases = Fusion(config(), compiled), []
+    for event in measurements(truth):
+        fusion.take(event)
+        if not phases or phases[-1][1] != fusion.history.head.stamps[PHASE]:
+            phases.append((float(fusion.history.head.stamps[T] - T0) / SECOND, int(fusion.history.head.stamps[PHASE])))
+    assert [phase for _, phase in phases][-2:] == [CHOOSING, RUNNING]
+    assert PULLS_AWAY_S < phases[-1][0] < PULLS_AWAY_S + 2.5
+    assert fusion.estimate_at(T0 + 2 * SECOND).mode is not Mode.LOST
+    assert not fusion.history.head.bank.any()  # nothing of it is left
+
+
+@needs_compiled
+def test_twin_and_kernel_agree_while_choosing() -> None:
+    truth = departing(4.0, seconds=3.5)
+    for until in (2.5, 3.5):
+        events = [event for event in measurements(truth) if event.t_ns < T0 + until * SECOND]
+        one, other = (fuse(config(), events, compiled).history.head for compiled in (True, False))
+        assert one.stamps[PHASE] == other.stamps[PHASE] == CHOOSING
+        np.testing.assert_allclose(one.bank[:, 0], other.bank[:, 0], rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(one.bank[:, 1:], other.bank[:, 1:], rtol=1e-9, atol=1e-9)
+
+
+@needs_compiled
+def test_one_wild_fix_decides_nothing() -> None:
+    """A velocity that is off by 60 m/s while the vehicle stands fits no heading better than another."""
+    events = measurements(departing(0.3, seconds=2.9))
+    wild = next(i for i, event in enumerate(events) if event.source == "gps0.velocity" and event.t_ns > T0 + 2 * SECOND)
+    event = events[wild]
+    events[wild] = Measurement(event.t_ns, event.source, event.sequence, event.t_receive_ns, GnssVelocity(60.0, 0.0, 0.0))
+    weights = fuse(config(), events, True).history.head.bank[:, 0]
+    assert weights.max() < 0.3
+    assert (weights > 0).sum() == 12
+
+
+def test_difference_is_what_inject_adds() -> None:
+    rng = np.random.default_rng(1)
+    state = running_state(rng)
+    moved, error = state.copy(), rng.normal(0.0, 1e-3, state.size)
+    inject(moved, error)
+    np.testing.assert_allclose(difference(moved, state), error, atol=1e-8)
+    assert abs(difference(moved, state)[ATTITUDE]).max() > 0
+
+
+def test_weights_sum_to_one_and_the_unlikely_go() -> None:
+    state = FilterState(1)
+    state.bank[0, 0], state.bank[1, 0], state.bank[2, 0] = 3.0, 1.0, 1e-10
+    normalise(state)
+    assert state.bank[:, 0].sum() == pytest.approx(1.0, abs=1e-9)
+    assert alive(state) == [0, 1]
+    assert len(state.bank) == HYPOTHESES

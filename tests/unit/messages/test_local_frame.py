@@ -1,0 +1,163 @@
+"""States in local frames, against matrices put together independently; the odometry frame under corrections."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion
+from fusiond.maths.wgs84 import ecef, mat_ne
+from fusiond.messages.local_frame import ENU_FLU, GAP_NS, NED_FRD, Convention, LocalFrame, LocalState, OdometryFrame, Placed
+from fusiond.messages.types import State
+
+ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FLU = np.diag([1.0, -1.0, -1.0])
+EARTH_RATE_E = np.array([0.0, 0.0, 7.292115e-5])  # rad/s
+AXES = [(ENU_FLU, ENU, FLU), (NED_FRD, np.eye(3), np.eye(3))]
+ORIGIN = (math.radians(48.1), math.radians(11.6), 520.0)
+
+
+def state(seed: int = 3, **given: Any) -> State:
+    """A random state some kilometres from ORIGIN."""
+    random = np.random.default_rng(seed)
+
+    def triple() -> tuple[float, ...]:
+        return tuple(random.normal(size=3).tolist())
+
+    def covariance() -> tuple[float, ...]:
+        root = random.normal(size=(3, 3))
+        product = root @ root.T
+        return tuple(((product + product.T) / 2).ravel().tolist())
+
+    turned = random.normal(size=4)
+    values: dict[str, Any] = {
+        "lat_deg": 48.1 + 0.1 * random.normal(),
+        "lon_deg": 11.6 + 0.1 * random.normal(),
+        "height_m": 500.0 + random.normal(),
+        "velocity_ned_mps": triple(),
+        "quaternion_nb": tuple((turned / np.linalg.norm(turned)).tolist()),
+        **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg", "wheel_scale", "sigma_wheel_scale"), 0.0),
+        **dict.fromkeys(("sigma_velocity_mps", "sigma_yaw_deg"), 1.0),
+        **{name: covariance() for name in State.__struct_fields__ if name.startswith("covariance")},
+        "mount_deg": (0.0, 0.0),
+        "sigma_mount_deg": (0.0, 0.0),
+        "sigma_gyro_bias_rps": tuple(abs(x) for x in triple()),
+    }
+    rest = [name for name in State.__struct_fields__ if name not in values]
+    return State(**{**values, **{name: triple() for name in rest}, **given})
+
+
+def square(block: tuple[float, ...]) -> NDArray[np.float64]:
+    return np.array(block).reshape(3, 3)
+
+
+@pytest.mark.parametrize(("convention", "world", "body"), AXES, ids=["enu_flu", "ned_frd"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_state_far_from_the_origin(
+    convention: Convention, world: NDArray[np.float64], body: NDArray[np.float64], seed: int
+) -> None:
+    s = state(seed)
+    position_e = ecef(math.radians(s.lat_deg), math.radians(s.lon_deg), s.height_m)
+    mat_le = world @ mat_ne(ecef(*ORIGIN))
+    mat_ln = mat_le @ mat_ne(position_e).T
+    mat_nb = matrix(np.array(s.quaternion_nb)) @ body
+    mat_lb = mat_ln @ mat_nb
+    local = LocalFrame(*ORIGIN, convention).state(s)
+
+    assert_allclose(local.position_l, mat_le @ (position_e - ecef(*ORIGIN)), atol=1e-8)
+    assert_allclose(matrix(np.array(local.quaternion_lb)), mat_lb, atol=1e-14)
+    assert_allclose(local.velocity_l, mat_ln @ s.velocity_ned_mps, atol=1e-14)
+    assert_allclose(local.velocity_b, mat_nb.T @ s.velocity_ned_mps, atol=1e-14)
+    rate_b = body @ s.angular_rate_b_rps - mat_lb.T @ mat_le @ EARTH_RATE_E
+    assert_allclose(local.angular_rate_b, rate_b, atol=1e-14)
+    assert_allclose(local.angular_rate_l, mat_lb @ rate_b, atol=1e-14)
+    for found, mat, covariance in (
+        (local.covariance_position_l, mat_ln, s.covariance_position_m2),
+        (local.covariance_attitude_l, mat_ln, s.covariance_attitude_rad2),
+        (local.covariance_velocity_b, mat_nb.T, s.covariance_velocity_m2ps2),
+    ):
+        assert_allclose(square(found), mat @ square(covariance) @ mat.T, atol=1e-13)
+        assert (square(found) == square(found).T).all()
+    there = LocalFrame(*ORIGIN, convention).covariance_axes(s.covariance_position_m2)
+    assert_allclose(square(there), world @ square(s.covariance_position_m2) @ world.T, atol=1e-14)
+
+
+def test_what_ros_people_expect() -> None:
+    """At the origin, heading east, 10 m/s, turning right: along x, yaw 0, turning about -z."""
+    east = tuple(quaternion(matrix_from_euler(0.0, 0.0, math.pi / 2)).tolist())
+    s = state(quaternion_nb=east, velocity_ned_mps=(0.0, 10.0, 0.0), angular_rate_b_rps=(0.0, 0.0, 0.5))
+    local = LocalFrame.at(s).state(s)
+    assert_allclose(local.position_l, 0.0, atol=1e-9)
+    assert_allclose(np.abs(local.quaternion_lb), (1.0, 0.0, 0.0, 0.0), atol=1e-15)
+    assert_allclose(local.velocity_l, (10.0, 0.0, 0.0), atol=1e-14)
+    assert_allclose(local.velocity_b, (10.0, 0.0, 0.0), atol=1e-14)
+    assert_allclose(local.angular_rate_l, (0.0, 0.0, -0.5), atol=1e-4)
+    up = LocalFrame.at(s).state(state(lat_deg=s.lat_deg, lon_deg=s.lon_deg, height_m=s.height_m + 7.0))
+    assert_allclose(up.position_l, (0.0, 0.0, 7.0), atol=1e-8)
+
+
+# --- The odometry frame
+
+STEP_NS, SPEED, TURN = 20_000_000, 10.0, 0.3  # ns, m/s, rad/s
+
+
+def driven(number: int, shift: float = 0.0, turned: float = 0.0) -> tuple[int, LocalState]:
+    """A circle, told with an error of position [m] and of heading [rad]."""
+    heading = TURN * number * STEP_NS / 1e9
+    radius = SPEED / TURN
+    told = heading + turned
+    none = (0.0,) * 9
+    x, y = radius * math.sin(heading) + shift, radius * (1 - math.cos(heading))
+    velocity = (SPEED * math.cos(told), SPEED * math.sin(told), 0.0)
+    half = (math.cos(told / 2), 0.0, 0.0, math.sin(told / 2))
+    rate = (0.0, 0.0, TURN)
+    return number * STEP_NS, LocalState((x, y, 0.0), half, velocity, (SPEED, 0.0, 0.0), rate, rate, none, none, none)  # type: ignore[arg-type]
+
+
+def joined(first: Placed, second: Placed) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    mat = matrix(np.array(first.quaternion))
+    return np.array(first.position) + mat @ second.position, mat @ matrix(np.array(second.quaternion))
+
+
+def heading(placed: Placed) -> float:
+    w, _, _, z = placed.quaternion
+    return 2 * math.atan2(z, w)
+
+
+def test_without_corrections_the_frames_stay_together() -> None:
+    frame = OdometryFrame()
+    for number in range(500):
+        odom, _ = frame.follow(*driven(number))
+    assert_allclose(odom.position, 0.0, atol=0.01)
+    assert heading(odom) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_reset_moves_the_odometry_frame_and_not_the_body_in_it() -> None:
+    frame = OdometryFrame()
+    before: Placed | None = None
+    for number in range(400):
+        jumped = number >= 200
+        t_ns, local = driven(number, *((30.0, 0.4) if jumped else (0.0, 0.0)))
+        odom, body = frame.follow(t_ns, local)
+        position, mat = joined(odom, body)
+        assert_allclose(position, local.position_l, atol=1e-9)
+        assert_allclose(mat, matrix(np.array(local.quaternion_lb)), atol=1e-12)
+        if before is not None:
+            assert math.dist(body.position, before.position) == pytest.approx(SPEED * STEP_NS / 1e9, rel=0.03)
+            turn = math.remainder(heading(body) - heading(before), math.tau)
+            assert turn == pytest.approx(TURN * STEP_NS / 1e9, abs=1e-9)
+        before = body
+        assert abs(heading(odom)) == pytest.approx(0.4 if jumped else 0.0, abs=1e-9)
+
+
+def test_over_a_pause_the_odometry_frame_rests() -> None:
+    frame = OdometryFrame()
+    for number in range(10):
+        odom, _ = frame.follow(*driven(number, shift=5.0 if number >= 5 else 0.0))
+    resumed = 10 + GAP_NS // STEP_NS
+    after, body = frame.follow(*driven(resumed, shift=5.0))
+    assert after == odom
+    assert_allclose(joined(after, body)[0], driven(resumed, shift=5.0)[1].position_l, atol=1e-9)
