@@ -22,7 +22,7 @@ import msgspec
 from fusiond import __version__
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
-from fusiond.messages.schedule import config_table
+from fusiond.messages.info import config_table
 from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
 from fusiond_adapters.foxglove.converter import SHOWN, Channel, Converter, Record, channels
 from fusiond_adapters.logs.black_box import FLUSH_S, MEGABYTE, file_name, make_room

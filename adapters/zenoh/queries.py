@@ -15,7 +15,7 @@ from threading import Lock
 import zenoh
 
 from fusiond.config.schema import Config
-from fusiond.messages.schedule import key as key_of
+from fusiond.messages.keys import key as key_of
 from fusiond.messages.types import Message, StateMessage, encode
 from fusiond_adapters.zenoh.session import CONTENT_TYPES, message_key
 

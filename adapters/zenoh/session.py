@@ -20,7 +20,7 @@ import zenoh.ext
 
 from fusiond.config.schema import Encoding
 from fusiond.config.schema import Zenoh as ZenohSection
-from fusiond.messages.schedule import key as key_of
+from fusiond.messages.keys import key as key_of
 from fusiond.messages.types import MESSAGES, InnovationMessage, Message, encode
 
 STREAMS = ("state", "settled", "innovations")

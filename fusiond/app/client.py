@@ -23,7 +23,7 @@ import zenoh.ext
 
 from fusiond.config.schema import Encoding
 from fusiond.config.schema import Zenoh as ZenohSection
-from fusiond.messages.schedule import key
+from fusiond.messages.keys import key
 from fusiond.messages.types import (
     ConfigMessage,
     HealthMessage,

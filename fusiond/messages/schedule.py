@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from typing import Any, NamedTuple, cast
 
-import msgspec
 import numpy as np
 
 from fusiond import __version__
@@ -23,21 +22,14 @@ from fusiond.estimator.solution import Mode
 from fusiond.events import Received
 from fusiond.filter.calibration import calibrations
 from fusiond.filter.hot_start import decided
-from fusiond.filter.observations import MODELS
-from fusiond.filter.parameters import IMU
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
-from fusiond.filter.step import Kernel
 from fusiond.messages.innovations import Innovations
 from fusiond.messages.types import (
-    MESSAGES,
-    SCHEMA_VERSION,
     Calibration,
     ClockHealth,
-    ConfigMessage,
     EventMessage,
     HealthMessage,
-    InfoMessage,
     InputHealth,
     LatencyHealth,
     Message,
@@ -281,39 +273,3 @@ def _clock_health(name: str | None, clocks: Mapping[str, ClockReport]) -> ClockH
         strays=report.strays,
         note=report.note,
     )
-
-
-# --- What does not change while it runs
-
-
-def key(vehicle: str, kind: str, source: str = "") -> str:
-    """Where a kind of message is published over Zenoh."""
-    return f"fusiond/{vehicle}/{kind}" + (f"/{source}" if source else "")
-
-
-def config_table(config: Config) -> dict[str, Any]:
-    """The configuration as a table of plain values, defaults filled in."""
-    table: dict[str, Any] = msgspec.to_builtins(config)
-    del table["directory"]
-    return table
-
-
-def info_message(config: Config, fusion: Fusion) -> InfoMessage:
-    """What is running here."""
-    vehicle, plan = config.vehicle.name, fusion.plan
-    kinds = ("imu" if model == IMU else MODELS[model].name for model in plan.models)
-    return InfoMessage(
-        vehicle=vehicle,
-        version=__version__,
-        kernel="numpy" if isinstance(fusion.history.kernel, Kernel) else "compiled",
-        encoding=config.publish.encoding,
-        schemas=dict.fromkeys(MESSAGES, SCHEMA_VERSION),
-        keys={kind: key(vehicle, kind, "*" if kind == "innovations" else "") for kind in MESSAGES},
-        sources=dict(zip(plan.sources, kinds, strict=True)),
-        config=config_table(config),
-    )
-
-
-def config_message(config: Config) -> ConfigMessage:
-    """The configuration in force."""
-    return ConfigMessage(vehicle=config.vehicle.name, config=config_table(config))

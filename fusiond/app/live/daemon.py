@@ -26,7 +26,8 @@ from fusiond.config.changes import changes
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.filter.stored_state import to_text
-from fusiond.messages.schedule import Surroundings, config_message, info_message
+from fusiond.messages.info import config_message, info_message
+from fusiond.messages.schedule import Surroundings
 from fusiond.messages.types import (
     EventMessage,
     HealthMessage,

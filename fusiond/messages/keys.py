@@ -1,0 +1,8 @@
+"""Where each kind of message is published over Zenoh."""
+
+from __future__ import annotations
+
+
+def key(vehicle: str, kind: str, source: str = "") -> str:
+    """The Zenoh key of a kind of message; innovations have a key for each source."""
+    return f"fusiond/{vehicle}/{kind}" + (f"/{source}" if source else "")
