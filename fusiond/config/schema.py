@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from msgspec import Meta, field
 
+from fusiond.config.sensor import INERTIAL, Sensor, Stream
 from fusiond.config.toml import Name, Section
+from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Pressure, WheelSpeed
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -15,6 +19,7 @@ Seconds = Annotated[float, Meta(gt=0, le=1_000_000)]
 Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
 Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 Vector = tuple[float, float, float]
+MILLISECOND = 1_000_000  # ns
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 Encoding = Literal["json", "msgpack"]
 Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
@@ -104,7 +109,7 @@ class Can(Section, frozen=True, kw_only=True):
     j1939: bool = False  # match 29-bit ids by PGN, of any priority and sender; always so where the DBC says J1939
 
 
-class Imu(Section, frozen=True, kw_only=True):
+class Imu(Sensor, frozen=True, kw_only=True):
     """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
 
     link: Name  # the [mavlink.LINK] it comes by
@@ -122,8 +127,11 @@ class Imu(Section, frozen=True, kw_only=True):
     accel_limit: Positive = 160.0  # a sample beyond this is invalid [m/s^2]
     gyro_limit: Positive = 35.0  # a sample beyond this is invalid [rad/s]
 
+    def streams(self) -> tuple[Stream, ...]:
+        return (Stream(INERTIAL, ImuSample, self.delay_ms),)
 
-class Gnss(Section, frozen=True, kw_only=True):
+
+class Gnss(Sensor, frozen=True, kw_only=True):
     """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
 
     link: Name  # the [mavlink.LINK] it comes by
@@ -150,8 +158,31 @@ class Gnss(Section, frozen=True, kw_only=True):
     minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # GPS_FIX_TYPE that a fix must have at least; 3: 3-D
     interval_s: Positive = 0.2  # expected spacing of fixes
 
+    def streams(self) -> tuple[Stream, ...]:
+        both = Stream("", GnssPosition, self.delay_ms, noise_min=self.noise_least, noise_max=self.noise_most,
+                      outlier_share=self.outlier_share if self.outliers == "mixture" else 0.0)  # fmt: skip
+        position = both._replace(
+            model="gnss_position",
+            suffix=".position",
+            correlation_s=self.position_correlation_s,
+            sigma=self.position_sigma_m,
+            group=self.group,
+            shared_sigma=self.shared_sigma_m,
+            companion=".velocity",
+        )
+        velocity = both._replace(
+            model="gnss_velocity",
+            payload=GnssVelocity,
+            suffix=".velocity",
+            delay_ms=self.delay_ms + self.velocity_delay_ms,
+            enabled=self.use_velocity,
+            correlation_s=self.velocity_correlation_s,
+            sigma=self.velocity_sigma_mps,
+        )
+        return position, velocity
 
-class Barometer(Section, frozen=True, kw_only=True):
+
+class Barometer(Sensor, frozen=True, kw_only=True):
     """[barometer.NAME]: a static pressure sensor, taken as a height with an unknown offset. At most one."""
 
     link: Name  # the [mavlink.LINK] it comes by
@@ -165,8 +196,21 @@ class Barometer(Section, frozen=True, kw_only=True):
     offset_sigma_m: Positive = 100.0  # first sigma of what it reads too much, which is learnt: weather and geoid
     offset_walk_m: NotNegative = 0.1  # its random walk [m/sqrt(s)]: weather, and air that is not the standard's
 
+    def streams(self) -> tuple[Stream, ...]:
+        return (
+            Stream(
+                "barometric_height",
+                Pressure,
+                self.delay_ms,
+                correlation_s=self.correlation_s,
+                sigma=self.sigma_m,
+                noise_min=self.noise_least,
+                noise_max=self.noise_most,
+            ),
+        )
 
-class Wheel(Section, frozen=True, kw_only=True):
+
+class Wheel(Sensor, frozen=True, kw_only=True):
     """[wheel.NAME]: one wheel; each is a source of its own. By CAN (bus, message, signal) or by MAVLink's WHEEL_DISTANCE
     (link, index)."""
 
@@ -200,6 +244,21 @@ class Wheel(Section, frozen=True, kw_only=True):
     quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
     correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
     delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)
+
+    def streams(self) -> tuple[Stream, ...]:
+        return (
+            Stream(
+                "wheel_speed",
+                WheelSpeed,
+                self.delay_ms,
+                correlation_s=self.correlation_s,
+                sigma=self.sigma_mps,
+                group=self.group,
+                shared_sigma=self.shared_sigma_mps,
+                noise_min=self.noise_least,
+                noise_max=self.noise_most,
+            ),
+        )
 
 
 class Publish(Section, frozen=True, kw_only=True):
@@ -319,6 +378,24 @@ class GroundStation(Section, frozen=True, kw_only=True):
     marker_system: Annotated[int, Meta(ge=0, le=255)] = 0  # system id of a vehicle that marks the state on the map; 0: none
 
 
+class ConfiguredSensor(NamedTuple):
+    """A sensor's table [table.name] of the configuration."""
+
+    table: str
+    name: str
+    section: Sensor
+
+
+class Source(NamedTuple):
+    """A source of measurements: the table that describes it, and which of the sensor's streams it is."""
+
+    table: str
+    name: str
+    section: Sensor
+    stream: Stream
+    delay_ns: int  # of the stream, with that of the bus
+
+
 class Config(Section, frozen=True, kw_only=True):
     """The whole file."""
 
@@ -348,10 +425,36 @@ class Config(Section, frozen=True, kw_only=True):
         """A file name of the configuration, resolved against its folder."""
         return Path(self.directory) / name
 
+    def sensors(self, **by: str) -> Iterator[ConfiguredSensor]:
+        """Every sensor, by kind in the order of the tables above; of one input alone with `link="NAME"` or `bus="NAME"`."""
+        for table in sensor_tables():
+            named: dict[str, Sensor] = getattr(self, table)
+            for name, section in named.items():
+                if by.items() <= section.inputs().items():
+                    yield ConfiguredSensor(table, name, section)
+
+    def streams(self) -> dict[str, Source]:
+        """Every source of measurements, by its name, in the order of `sensors`. KeyError where a bus is missing."""
+        found = {}
+        for table, name, section in self.sensors():
+            bus = section.inputs().get("bus")
+            bus_ms = 0.0 if bus is None else self.can[bus].delay_ms
+            for stream in section.streams():
+                delay_ns = round((stream.delay_ms + bus_ms) * MILLISECOND)
+                found[name + stream.suffix] = Source(table, name, section, stream, delay_ns)
+        return found
+
     def sources(self) -> tuple[str, ...]:
-        """Every source of measurements, in the order that breaks ties of time."""
-        gnss = [f"{name}.{kind}" for name in self.gnss for kind in ("position", "velocity")]
-        return tuple(sorted([*self.imu, *gnss, *self.wheel, *self.barometer]))
+        """The names of the sources of measurements, in the order that breaks ties of time."""
+        return tuple(sorted(name + stream.suffix for _, name, section in self.sensors() for stream in section.streams()))
+
+
+@cache
+def sensor_tables() -> dict[str, type[Sensor]]:
+    """The tables of Config that describe sensors, with the kind of each: those whose type is a dict of Sensor."""
+    hints = get_type_hints(Config)
+    kinds = {table: get_args(hint)[1] for table, hint in hints.items() if get_origin(hint) is dict}
+    return {table: kind for table, kind in kinds.items() if issubclass(kind, Sensor)}
 
 
 MOST_SCALES = 4

@@ -335,7 +335,7 @@ class Clock:
     """Turns what was received into measurements on one time line."""
 
     def __init__(self, config: Config) -> None:
-        self._delays = _delays(config)
+        self._delays = {name: source.delay_ns for name, source in config.streams().items()}
         self._aligners = {UNIX_CLOCK: _Aligner(None)}
         self._arrivals = 0
 
@@ -389,15 +389,3 @@ class Clock:
             boot.complaint = f"SYSTEM_TIME refused: {unix_placed}"
         elif not isinstance(boot_placed, str):
             boot.learn_pair(stamp - pair.t_ns, received.t_receive_ns)
-
-
-def _delays(config: Config) -> dict[str, int]:
-    """How long before its stamp each source's sample was true [ns]."""
-    delays = {name: imu.delay_ms for name, imu in config.imu.items()}
-    for name, gnss in config.gnss.items():
-        delays[f"{name}.position"] = gnss.delay_ms
-        delays[f"{name}.velocity"] = gnss.delay_ms + gnss.velocity_delay_ms
-    for name, wheel in config.wheel.items():
-        delays[name] = wheel.delay_ms + (config.can[wheel.bus].delay_ms if wheel.bus else 0.0)
-    delays |= {name: barometer.delay_ms for name, barometer in config.barometer.items()}
-    return {name: round(delay * MILLISECOND) for name, delay in delays.items()}
