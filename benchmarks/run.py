@@ -26,9 +26,10 @@ from fusiond import __version__
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
+from fusiond.filter.kernel.interpreted import Kernel, make_kernel
 from fusiond.filter.parameters import SECOND
+from fusiond.filter.rows import ROW
 from fusiond.filter.state import NEVER, T_LAST, FilterState, T
-from fusiond.filter.step import ROW, Kernel, make_kernel
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.write import write_drive
 

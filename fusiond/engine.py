@@ -15,7 +15,7 @@ from fractions import Fraction
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import ImuSample, Received
-from fusiond.filter.step import Outcome
+from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fusiond.filter.step import compiled_available
+from fusiond.filter.kernel.interpreted import compiled_available
 
 needs_compiled = pytest.mark.skipif(not compiled_available(), reason="the compiled kernel was not built")
 

@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.study.runs import start_covariance, true_state
 from benchmarks.study.world import WHEEL_PHASE_S, World
 from fusiond.config.schema import Config
-from fusiond.filter.observations import CONSTRAINTS, MODELS
+from fusiond.filter.observations import CONSTRAINTS, IMU, MODEL, MODELS
 from fusiond.filter.observations.model import Observation, with_rate_noise
-from fusiond.filter.parameters import IMU, MODEL, plan
+from fusiond.filter.parameters import plan
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -32,7 +32,8 @@ from fusiond.filter.state import (
 )
 from fusiond.maths.portable import square
 from fusiond.maths.rotation import quaternion, skew
-from fusiond.maths.wgs84 import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import EARTH_RATE, MU
 
 EARTH_SKEW = skew(np.array([0.0, 0.0, EARTH_RATE]))
 
@@ -45,7 +46,7 @@ def dynamics(world: World, k: int) -> Array:
     place = world.position_e[k]
     r2 = float(place @ place)
     f[POSITION, VELOCITY] = np.eye(3)
-    f[VELOCITY, POSITION] = GRAVITATIONAL_CONSTANT / r2**1.5 * (3 * np.outer(place, place) / r2 - np.eye(3))
+    f[VELOCITY, POSITION] = MU / r2**1.5 * (3 * np.outer(place, place) / r2 - np.eye(3))
     f[VELOCITY, VELOCITY] = -2 * EARTH_SKEW
     f[VELOCITY, ATTITUDE] = -skew(force_e)
     f[VELOCITY, ACCEL_BIAS] = -mat_eb

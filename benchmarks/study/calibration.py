@@ -19,7 +19,7 @@ from fusiond.filter.state import (
     MOUNT_ERROR,
     SCALE,
 )
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 AT_S = (5, 15, 30, 60, 115)
 ROUNDS = 2

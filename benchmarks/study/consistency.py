@@ -18,9 +18,9 @@ from benchmarks.study.report import Section, figure
 from benchmarks.study.runs import BLOCKS, Ledger, begun, drive, error, spread
 from benchmarks.study.world import Sensors, World
 from fusiond.config.schema import Config
-from fusiond.filter.parameters import IMU
+from fusiond.filter.observations import IMU
 from fusiond.filter.state import CONSTRAINT_RATIO
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 LOOK_PHASE_S = 0.195  # just before a fix, and no fix is on its way

@@ -16,6 +16,7 @@ from fusiond.estimator.fusion import Fusion
 from fusiond.events import Measurement
 from fusiond.filter.motion_constraints import watch
 from fusiond.filter.parameters import Plan, nanoseconds
+from fusiond.filter.rows import Outcome, Rows
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
@@ -44,9 +45,8 @@ from fusiond.filter.state import (
     FilterState,
     T,
 )
-from fusiond.filter.step import Outcome, Rows
 from fusiond.maths.rotation import matrix, quaternion, quaternion_exp, quaternion_multiply
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Scenario
 
 BLOCKS = {

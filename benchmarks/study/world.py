@@ -18,7 +18,8 @@ from fusiond.config.schema import Config, Wheel, wheel_groups
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.filter.parameters import plan, scale_state
 from fusiond.filter.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
-from fusiond.maths.wgs84 import ECCENTRICITY2, Array
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import ECCENTRICITY2
 from fusiond.simulation import imu as inertial_sensor
 from fusiond.simulation import wgs84
 from fusiond.simulation.gnss import gauss_markov

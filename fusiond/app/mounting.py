@@ -24,7 +24,7 @@ from fusiond.config.schema import Config
 from fusiond.errors import UnusableError
 from fusiond.events import GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.maths.rotation import euler, matrix, matrix_from_euler, quaternion_exp, skew
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 BIN_NS = 100_000_000  # readings are averaged over so long on arrival
 BIN = BIN_NS * 1e-9  # s

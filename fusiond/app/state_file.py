@@ -7,7 +7,8 @@ import os
 from pathlib import Path
 
 from fusiond.config.schema import Config
-from fusiond.filter.hot_start import WORDS, Verdict
+from fusiond.filter.hot_start import WORDS
+from fusiond.filter.state import Verdict
 from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, to_text
 from fusiond.messages.types import OutputHealth
 

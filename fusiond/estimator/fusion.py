@@ -13,11 +13,13 @@ from fusiond.config.schema import Config, Imu
 from fusiond.estimator.history import History
 from fusiond.estimator.solution import COVARIANCE_SIZE, Estimate, Mode, StateEstimate
 from fusiond.events import ImuSample, Invalid, Measurement, Received, Vector3
-from fusiond.filter.hot_start import Verdict, decided, leading, leads
+from fusiond.filter.hot_start import leading, leads
+from fusiond.filter.kernel.interpreted import AnyKernel
 from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
-from fusiond.filter.observations import MODELS
+from fusiond.filter.observations import IMU, MODELS
 from fusiond.filter.observations.model import Unusable, within
-from fusiond.filter.parameters import IMU, SECOND, nanoseconds, plan, section_of
+from fusiond.filter.parameters import SECOND, nanoseconds, plan, section_of
+from fusiond.filter.rows import Outcome
 from fusiond.filter.source_health import Belief, belief
 from fusiond.filter.state import (
     ACCEL_BIAS,
@@ -25,7 +27,7 @@ from fusiond.filter.state import (
     FORCE_B,
     GYRO_BIAS,
     GYRO_BIAS_B,
-    LAST_VALUE,
+    HOT_START,
     MOUNT,
     MOUNT_ERROR,
     NEVER,
@@ -40,8 +42,8 @@ from fusiond.filter.state import (
     WHEEL_SCALE,
     FilterState,
     T,
+    Verdict,
 )
-from fusiond.filter.step import AnyKernel, Outcome
 from fusiond.filter.stored_state import StoredState, check, stored_state
 from fusiond.timeline.clock import Clock
 
@@ -107,18 +109,18 @@ class Fusion:
         """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
         instant before the head's gives the head itself."""
         self._carried.copy_from(self.history.head)
-        state, resets = self._told(self._carried)
+        state = self._published(self._carried)
         self.history.kernel.predict(state, t_ns)
-        return self._estimate(state, t_ns, resets)
+        return self._estimate(state, t_ns)
 
     def settled(self) -> Estimate:
         """The estimate at the horizon, which no late event can change any more."""
-        state, resets = self._told(self.history.settled())
-        return self._estimate(state, int(state.stamps[T]), resets)
+        state = self._published(self.history.settled())
+        return self._estimate(state, int(state.stamps[T]))
 
     def hot_start(self) -> Verdict:
         """What became of the stored state."""
-        return Verdict(int(self.history.head.memory[self.plan.imu_source, LAST_VALUE]))
+        return Verdict(int(self.history.head.stamps[HOT_START]))
 
     def to_store(self) -> StoredState | None:
         """The newest state, for a hot start of the next run; None while there is none."""
@@ -158,15 +160,12 @@ class Fusion:
             raise Unusable("not finite")
         return values
 
-    def _told(self, state: FilterState) -> tuple[FilterState, int]:
-        """What is told of a state, and how often that was reset: that the drive decides on a stored heading counts too."""
-        resets = int(state.stamps[RESETS])
-        if leads(state, self.plan):
-            return leading(state), resets
-        return state, resets + decided(state, self.plan)
+    def _published(self, state: FilterState) -> FilterState:
+        """What is published of a state: while a bank is sure of a stored heading, the hypothesis of that."""
+        return leading(state) if leads(state, self.plan) else state
 
-    def _estimate(self, state: FilterState, t_ns: int, resets: int) -> Estimate:
-        stamps = state.stamps
+    def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
+        stamps, resets = state.stamps, int(state.stamps[RESETS])
         age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
         if stamps[PHASE] != RUNNING:
             return Estimate(t_ns, Mode.ALIGNING, age, resets, None)

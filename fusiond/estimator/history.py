@@ -20,9 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.events import Measurement
-from fusiond.filter.parameters import IMU, Plan
+from fusiond.filter.kernel.interpreted import keep, make_kernel
+from fusiond.filter.observations import IMU
+from fusiond.filter.parameters import Plan
+from fusiond.filter.rows import ROW, Outcome, Rows
 from fusiond.filter.state import NEVER, FilterState
-from fusiond.filter.step import ROW, Outcome, Rows, keep, make_kernel, run_one
+from fusiond.filter.step import run_one
 
 FIRST_ROWS = 4096
 FIRST_SNAPSHOTS = 64

@@ -2,7 +2,7 @@
 
 Every hypothesis is a whole state and covariance, carried and updated like the one of a running filter, and weighed by the
 likelihood of what is measured; they share the inertial sample and what is remembered of the sources. When the spread of
-their headings is small they are collapsed by their moments (B6), and the filter runs. Until then there is no state to tell.
+their headings is small they are collapsed by their moments (B6), and the filter runs. Until then there is no state.
 
 A measurement that fits no hypothesis is an outlier: its likelihood is floored, so that a single one decides nothing.
 """
@@ -13,163 +13,214 @@ import math
 
 import numpy as np
 
-from fusiond.filter.measurement_update import ADDED, cholesky, inject, update, whiten
-from fusiond.filter.motion_constraints import ZERO_ROTATION, ZERO_VELOCITY, constraints_due
-from fusiond.filter.observations import CONSTRAINTS, non_holonomic
-from fusiond.filter.observations.model import LEVER_ARM_B, Observation, point_velocity_v, with_rate_noise
+from fusiond.filter.measurement import share_noise
+from fusiond.filter.measurement_update import cholesky, difference, inject, project, update_projected, whiten
+from fusiond.filter.motion_constraints import (
+    NON_HOLONOMIC,
+    ZERO_ROTATION,
+    ZERO_VELOCITY,
+    constraints_due,
+    observe_constraint,
+)
+from fusiond.filter.observations import WHEEL_SPEED, non_holonomic, observe, wheel_speed
+from fusiond.filter.observations.model import Observation, with_rate_noise
 from fusiond.filter.parameters import Plan
 from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS
 from fusiond.filter.state import (
     ATTITUDE,
-    CALIBRATIONS,
+    HOT_START,
     HYPOTHESES,
     NEVER,
     PHASE,
     POSITION_E,
-    QUATERNION_EB,
+    RESET_REASON,
+    RESETS,
     RUNNING,
     T_JUDGED,
     FilterState,
+    ResetReason,
+    Verdict,
 )
+from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp
-from fusiond.maths.rotation import quaternion_multiply
-from fusiond.maths.wgs84 import Array, mat_ne
+from fusiond.maths.typed import ErrorRows3, Matrix3, Vector, compiled
+from fusiond.maths.wgs84 import mat_ne
 
-LEAST_WEIGHT = 1e-9  # a hypothesis less likely than this is given up
+MIN_WEIGHT = 1e-9  # a hypothesis less likely than this is given up
 FAR = math.radians(30.0)  # rad: a heading this far off is another one, not the same less sure
 DOUBT = 1e-4  # the bank is not collapsed while headings that are far off are likelier than this, all together
 CLUTTER = OUTLIERS  # share of measurements that fit nothing
+MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 
 
-def alive(state: FilterState) -> list[int]:
-    """The hypotheses that have not been given up."""
-    return [i for i in range(HYPOTHESES) if state.bank[i, 0] > 0]
-
-
-def weigh(state: FilterState, i: int, hypothesis: FilterState, seen: Observation, factor: float) -> None:
-    """Multiply a hypothesis's weight by the likelihood of an observation, whose error it shares with those before."""
-    spread = seen.jacobian @ hypothesis.covariance @ seen.jacobian.T
-    widened = seen._replace(variance=factor * seen.variance)
-    lower, whitened = cholesky(spread + np.diag(widened.variance)), whiten(hypothesis, widened)
-    if lower is None or whitened is None:
+@compiled
+def weigh(state: FilterState, i: int, seen: Observation, factor: float, spread: Matrix3) -> None:
+    """Multiply a hypothesis's weight by the likelihood of an observation, of H P H' (m, m), whose error it shares with those
+    before."""
+    m = seen.m
+    lower, widened, whitened = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for a in range(m):
+        widened[a] = factor * seen.variance[a]
+    if not cholesky(spread, widened, 1.0, m, lower) or not whiten(spread, seen.innovation, widened, m, whitened):
         return
     square, size = 0.0, 1.0
-    for a in range(len(whitened)):
+    for a in range(m):
         square += whitened[a] * whitened[a]
         size *= lower[a, a]
-    floor = exp(-min(square, 1000.0) / (2 * OUTLIER_VARIANCE))
-    for _ in range(len(whitened)):
-        floor /= math.sqrt(OUTLIER_VARIANCE)
-    state.bank[i, 0] *= ((1 - OUTLIERS) * exp(-square / 2) + OUTLIERS * floor) / size
+    lowest = exp(-min(square, MAX_SQUARE) / (2 * OUTLIER_VARIANCE))
+    for _a in range(m):
+        lowest /= math.sqrt(OUTLIER_VARIANCE)
+    state.bank[i, 0] *= ((1 - OUTLIERS) * exp(-square / 2) + OUTLIERS * lowest) / size
 
 
+@compiled
 def take(
-    state: FilterState,
-    i: int,
-    hypothesis: FilterState,
-    seen: Observation,
-    gate: float,
-    factor: float,
-    certain: Observation | None = None,
+    state: FilterState, i: int, hypothesis: FilterState, seen: Observation, factor: float, plan: Plan, weighed: bool = True
 ) -> None:
-    """Weigh a hypothesis by an observation, and update it; `certain` is what it is weighed by where that is another."""
-    weigh(state, i, hypothesis, certain or seen, factor)
-    update(hypothesis, seen, gate, factor, True, CLUTTER)
+    """Weigh a hypothesis by an observation, unless it was by another, and update it."""
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    project(hypothesis, seen, across, spread)
+    if weighed:
+        weigh(state, i, seen, factor, spread)
+    update_projected(hypothesis, seen, plan.gates[seen.m], factor, True, CLUTTER, across, spread)
 
 
+@compiled
+def measure(state: FilterState, i: int, model: int, values: Vector, parameter: Vector, factor: float, plan: Plan) -> None:
+    """Take one measurement into a hypothesis. A wheel weighs it by the direction that the hypothesis says it turns in."""
+    hypothesis = state.hypothesis(i)
+    seen = Observation(state.size)
+    if model == WHEEL_SPEED:
+        wheel_speed.observe_certain(hypothesis, values, parameter, seen)
+        share_noise(hypothesis, seen, parameter)
+        across, spread = np.empty((3, state.size)), np.empty((3, 3))
+        project(hypothesis, seen, across, spread)
+        weigh(state, i, seen, factor, spread)
+    if observe(hypothesis, model, values, parameter, seen):
+        share_noise(hypothesis, seen, parameter)
+        take(state, i, hypothesis, seen, factor, plan, model != WHEEL_SPEED)
+
+
+@compiled
 def constrain(state: FilterState, plan: Plan) -> None:
     """Apply the motion constraints that are due to every hypothesis; one that would have the vehicle go sideways pays."""
     still, rolling = constraints_due(state, plan)
     if not (still or rolling):
         return
-    for i in alive(state):
-        hypothesis = state.hypothesis(i)
-        if still:
-            for which, factor in ((ZERO_VELOCITY, plan.zero_velocity_factor), (ZERO_ROTATION, 1.0)):
-                parameters = plan.constraints[which]
-                seen = CONSTRAINTS[which].observe(hypothesis, parameters, parameters)
-                assert seen is not None, "a vehicle at rest is always observed"
-                take(state, i, hypothesis, with_rate_noise(hypothesis, seen), plan.gates[len(seen.innovation)], factor)
+    seen = Observation(state.size)
+    for i in range(HYPOTHESES):
+        if still and state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            observe_constraint(hypothesis, ZERO_VELOCITY, plan, seen)
+            with_rate_noise(hypothesis, seen)
+            take(state, i, hypothesis, seen, plan.zero_velocity_factor, plan)
+            observe_constraint(hypothesis, ZERO_ROTATION, plan, seen)
+            with_rate_noise(hypothesis, seen)
+            take(state, i, hypothesis, seen, 1.0, plan)
     if rolling and not still:
         _roll(state, plan)
     normalise(state)
 
 
+@compiled
 def _roll(state: FilterState, plan: Plan) -> None:
     """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction."""
-    parameters, kept = plan.constraints[0], alive(state)
-    variance = np.array([parameters[non_holonomic.LATERAL_VARIANCE], parameters[non_holonomic.VERTICAL_VARIANCE]])
-    seen, fastest = [], 0.0
-    for i in kept:
-        velocity_v, by_error = point_velocity_v(state.hypothesis(i), parameters[LEVER_ARM_B])
-        seen.append(Observation(-velocity_v[1:], by_error[1:], variance))
-        fastest = max(fastest, math.sqrt(velocity_v[0] * velocity_v[0] + velocity_v[1] * velocity_v[1]))
-    if fastest < parameters[non_holonomic.LEAST_SPEED]:
+    parameter = plan.constraints[NON_HOLONOMIC]
+    seen = Observation(state.size)
+    fastest = 0.0
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            fastest = max(fastest, non_holonomic.observe_at_any_speed(hypothesis, parameter, seen))
+    if fastest < parameter[non_holonomic.MIN_SPEED]:
         return
-    for i, observation in zip(kept, seen, strict=True):
-        take(state, i, state.hypothesis(i), with_rate_noise(state, observation), plan.gates[2], 1.0)
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            non_holonomic.observe_at_any_speed(hypothesis, parameter, seen)
+            with_rate_noise(hypothesis, seen)
+            take(state, i, hypothesis, seen, 1.0, plan)
 
 
+@compiled
 def normalise(state: FilterState) -> None:
     """Let the weights sum to 1, and give up those that have become too small."""
-    weights, total = state.bank[:, 0], 0.0
+    total = 0.0
     for i in range(HYPOTHESES):
-        total += weights[i]
+        total += state.bank[i, 0]
     for i in range(HYPOTHESES):
-        weights[i] = weights[i] / total if total > 0 else 0.0
-        if weights[i] < LEAST_WEIGHT:
-            weights[i] = 0.0
+        state.bank[i, 0] = state.bank[i, 0] / total if total > 0 else 0.0
+        if state.bank[i, 0] < MIN_WEIGHT:
+            state.bank[i, 0] = 0.0
 
 
+@compiled
 def settle(state: FilterState, plan: Plan) -> None:
-    """Normalise, and collapse the bank where the headings are close together and hardly any is far off: the
-    filter then runs."""
+    """Normalise, and collapse the bank where the headings are close together and hardly any is far off: the filter then
+    runs."""
     normalise(state)
-    kept = alive(state)
-    if not kept:
-        return
-    best = kept[0]
-    for i in kept:
-        if state.bank[i, 0] > state.bank[best, 0]:
+    best = -1
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0 and (best < 0 or state.bank[i, 0] > state.bank[best, 0]):
             best = i
-    down_e = mat_ne(state.hypothesis(best).nominal[POSITION_E])[2]
-    errors = [difference(state.hypothesis(i), state.hypothesis(best)) for i in kept]
-    mean, spread = 0.0, 0.0
-    turns = [float(down_e @ error[ATTITUDE]) for error in errors]
-    for i, turn in zip(kept, turns, strict=True):
-        mean += state.bank[i, 0] * turn
-    for i, turn in zip(kept, turns, strict=True):
-        own = float(down_e @ state.hypothesis(i).covariance[ATTITUDE, ATTITUDE] @ down_e)
-        spread += state.bank[i, 0] * (own + (turn - mean) * (turn - mean))
-    doubt = 0.0
-    for i, turn in zip(kept, turns, strict=True):
-        doubt += state.bank[i, 0] if abs(turn) > FAR else 0.0
+    if best < 0:
+        return
+    likeliest = state.hypothesis(best)
+    to_n = mat_ne(likeliest.nominal[POSITION_E])
+    down = to_n[2]
+    errors, turns = np.zeros((HYPOTHESES, state.size)), np.zeros(HYPOTHESES)
+    mean = spread = doubt = 0.0
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            errors[i] = difference(hypothesis, likeliest)
+            turn = errors[i, ATTITUDE]
+            turns[i] = down[0] * turn[0] + down[1] * turn[1] + down[2] * turn[2]
+            mean += state.bank[i, 0] * turns[i]
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            own = _variance_along(hypothesis, down[0], down[1], down[2])
+            spread += state.bank[i, 0] * (own + (turns[i] - mean) * (turns[i] - mean))
+            if abs(turns[i]) > FAR:
+                doubt += state.bank[i, 0]
     if spread <= plan.heading_variance and doubt <= DOUBT:
-        _collapse(state, best, kept, errors)
+        _collapse(state, best, errors)
 
 
-def difference(a: FilterState, b: FilterState) -> Array:
-    """The error (n,) that carries b into a; the rotation to the second order."""
-    error = np.zeros(a.size)
-    for nominal, block in ADDED:
-        error[block] = a.nominal[nominal] - b.nominal[nominal]
-    error[CALIBRATIONS:] = a.nominal[CALIBRATIONS + 1 : a.size + 1] - b.nominal[CALIBRATIONS + 1 : a.size + 1]
-    back = b.nominal[QUATERNION_EB] * (1.0, -1.0, -1.0, -1.0)
-    turn = quaternion_multiply(a.nominal[QUATERNION_EB], back)
-    error[ATTITUDE] = turn[1:] * (2.0 if turn[0] >= 0 else -2.0)
-    return error
+@compiled
+def _variance_along(hypothesis: FilterState, x: float, y: float, z: float) -> float:
+    """Variance of the rotation about an earth-fixed axis (x, y, z) [rad^2]."""
+    p, phi = hypothesis.covariance, ATTITUDE.start
+    turned = np.empty(3)
+    for a in range(3):
+        turned[a] = p[phi + a, phi] * x + p[phi + a, phi + 1] * y + p[phi + a, phi + 2] * z
+    return x * turned[0] + y * turned[1] + z * turned[2]
 
 
-def _collapse(state: FilterState, best: int, kept: list[int], errors: list[Array]) -> None:
-    """Mean and covariance of the mixture, about its likeliest component (B6)."""
-    mean, covariance = np.zeros(state.size), np.zeros((state.size, state.size))
-    for i, error in zip(kept, errors, strict=True):
-        mean += state.bank[i, 0] * error
-    for i, error in zip(kept, errors, strict=True):
-        covariance += state.bank[i, 0] * (state.hypothesis(i).covariance + np.outer(error - mean, error - mean))
-    state.nominal[:] = state.hypothesis(best).nominal
-    state.covariance[:] = (covariance + covariance.T) / 2
+@compiled
+def _collapse(state: FilterState, best: int, errors: ErrorRows3) -> None:
+    """Mean and covariance of the mixture, about its likeliest component (B6), from which the hypotheses are off by `errors`
+    (HYPOTHESES, n)."""
+    p, mean = state.covariance, np.zeros(state.size)
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            mean += state.bank[i, 0] * errors[i]
+    p[:] = 0.0
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            weight = state.bank[i, 0]
+            hypothesis = state.hypothesis(i)
+            for j in range(state.size):
+                p[j] += weight * (hypothesis.covariance[j] + (errors[i, j] - mean[j]) * (errors[i] - mean))
+    mirror(p)
+    likeliest = state.hypothesis(best)
+    state.nominal[:] = likeliest.nominal
     inject(state, mean)
     state.bank[:] = 0.0
     state.stamps[PHASE] = RUNNING
-    state.source_stamps[:, T_JUDGED] = NEVER
+    if state.stamps[HOT_START] == Verdict.BELIEVED:  # its state was published meanwhile
+        state.stamps[RESETS] += 1
+        state.stamps[RESET_REASON] = ResetReason.HEADING_DECIDED
+    for source in range(state.sources):
+        state.source_stamps[source, T_JUDGED] = NEVER

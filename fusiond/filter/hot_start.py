@@ -9,16 +9,28 @@ level agree it leads the bank, and as long as it does, its state is told: a park
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 from typing import NamedTuple
 
 from fusiond.filter.observations.model import LEVER_ARM_B
 from fusiond.filter.parameters import Plan
-from fusiond.filter.state import CHOOSING, FIX_E, FIX_VARIANCE, LAST_VALUE, PHASE, RESETS, RUNNING, STORED, FilterState, T
+from fusiond.filter.state import (
+    CHOOSING,
+    FIX_E,
+    FIX_VARIANCE,
+    HOT_START,
+    PHASE,
+    RESETS,
+    RUNNING,
+    STORED,
+    FilterState,
+    T,
+    Verdict,
+)
 from fusiond.filter.stored_state import StoredState
 from fusiond.maths.portable import square
 from fusiond.maths.rotation import matrix_from_euler, product
-from fusiond.maths.wgs84 import Array, ecef, mat_ne
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import ecef, mat_ne
 
 BELIEVED_WEIGHT = 0.8  # of the stored heading where all agrees: it takes evidence, not chance, to collapse the bank on it
 LEADS = 0.5  # weight from which it is told as the state
@@ -30,20 +42,6 @@ LEVEL_AGREES = math.radians(1.5)  # rad: passengers and fuel tilt no vehicle mor
 SHARP = 10.0  # m: places known no better than this tell little
 ROLLED = 20.0  # m, how far a vehicle that was parked may have gone before the filter starts
 BRIEF = 5.0  # s: for so long after a stop in motion its heading is worth something
-
-
-class Verdict(IntEnum):
-    """What became of a stored state at the start: LAST_VALUE in the memory of the inertial sensor."""
-
-    NONE = 0  # there is none, or the filter has not started yet
-    BELIEVED = 1
-    DOUBTED = 2
-    OTHERWISE_KNOWN = 3
-    MOVED = 4
-    IN_MOTION = 5
-    VAGUE = 6
-    FUTURE = 7
-    STALE = 8
 
 
 WORDS = {
@@ -75,7 +73,7 @@ def recall(state: FilterState, plan: Plan) -> tuple[StoredState | None, Verdict]
     age_ns = int(state.stamps[T]) - stored.t_ns
     if age_ns < 0:
         return None, Verdict.FUTURE
-    return (None, Verdict.STALE) if age_ns > plan.stored_most_ns else (stored, Verdict.OTHERWISE_KNOWN)
+    return (None, Verdict.STALE) if age_ns > plan.max_stored_age_ns else (stored, Verdict.OTHERWISE_KNOWN)
 
 
 def aged(stored: StoredState, state: FilterState, plan: Plan) -> tuple[list[float], list[float]]:
@@ -119,15 +117,9 @@ def heading(
 
 def leads(state: FilterState, plan: Plan) -> bool:
     """Whether a bank is so sure of the stored heading that its state is told."""
-    if state.stamps[PHASE] != CHOOSING or float(state.memory[plan.imu_source, LAST_VALUE]) != Verdict.BELIEVED:
+    if state.stamps[PHASE] != CHOOSING or state.stamps[HOT_START] != Verdict.BELIEVED:
         return False
     return bool(state.bank[STORED, 0] >= LEADS)
-
-
-def decided(state: FilterState, plan: Plan) -> bool:
-    """Whether the drive has replaced a stored heading that was told: the told state has jumped."""
-    believed = float(state.memory[plan.imu_source, LAST_VALUE]) == Verdict.BELIEVED
-    return bool(believed and (state.stamps[PHASE] == RUNNING or state.stamps[RESETS] > 0))
 
 
 def leading(state: FilterState) -> FilterState:

@@ -14,9 +14,19 @@ import numpy as np
 
 from fusiond.filter import hot_start
 from fusiond.filter.motion_constraints import MEAN_FILLED, MEAN_TIME, ZERO_VELOCITY, watch
-from fusiond.filter.observations import gnss_position, gnss_velocity, wheel_speed, zero_velocity
+from fusiond.filter.observations import (
+    GNSS_POSITION,
+    GNSS_VELOCITY,
+    IMU,
+    WHEEL_SPEED,
+    gnss_position,
+    gnss_velocity,
+    wheel_speed,
+    zero_velocity,
+)
 from fusiond.filter.observations.model import LEVER_ARM_B
-from fusiond.filter.parameters import IMU, MODEL, SECOND, Plan
+from fusiond.filter.parameters import SECOND, Plan
+from fusiond.filter.rows import Row
 from fusiond.filter.source_health import arrive
 from fusiond.filter.state import (
     ACCEL_BIAS_B,
@@ -35,7 +45,8 @@ from fusiond.filter.state import (
     GYRO_BIAS_B,
     HELD_FORCE_B,
     HELD_RATE_B,
-    LAST_VALUE,
+    HOT_START,
+    LAST_SPEED,
     MEAN_FORCE_B,
     MEAN_RATE_B,
     MEAN_WEIGHT,
@@ -66,11 +77,12 @@ from fusiond.filter.state import (
 from fusiond.filter.stored_state import StoredState
 from fusiond.maths.portable import atan2, sin_cos, square
 from fusiond.maths.rotation import matrix, matrix_from_euler, product, quaternion
-from fusiond.maths.wgs84 import Array, geodetic_trig, mat_ne, mat_ne_from_trig
+from fusiond.maths.typed import Array, compiled
+from fusiond.maths.wgs84 import geodetic_trig, mat_ne, mat_ne_from_trig
 
 FIX_FRESH_NS = 2 * SECOND  # a fix older than this does not start the filter
-WINDOW_LEAST_NS = SECOND  # the GNSS velocities that tell the vehicle's acceleration lie at least so far apart
-WINDOW_MOST_NS = 3 * SECOND  # and at most so far
+MIN_WINDOW_NS = SECOND  # the GNSS velocities that tell the vehicle's acceleration lie at least so far apart
+MAX_WINDOW_NS = 3 * SECOND  # and at most so far
 REST_FRESH_NS = 600 * SECOND  # a standstill longer ago tells nothing of the gyro bias
 REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
 ALL_ROUND = 12  # hypotheses of an unknown heading
@@ -86,38 +98,50 @@ def begin(state: FilterState) -> None:
     state.source_stamps[:] = NEVER
 
 
-def gather(state: FilterState, t_ns: int, source: int, values: Array, plan: Plan) -> None:
+def gather(state: FilterState, row: Row, plan: Plan) -> None:
     """Take in one event while aligning, and start the filter if it completes what is needed."""
-    stamps, auxiliary = state.stamps, state.auxiliary
+    stamps, auxiliary, values = state.stamps, state.auxiliary, row["values"]
+    t_ns, source = int(row["t_ns"]), int(row["source"])
     model = plan.models[source]
     stamps[T] = t_ns
-    if model == IMU:
-        force_b, rate_b = values[0:3], values[3:6]
-        arrive(state.memory[source], state.source_stamps[source], values, t_ns)
-        if stamps[T_IMU] != NEVER:
-            watch(state, force_b, rate_b, (t_ns - stamps[T_IMU]) * 1e-9, plan)
-        stamps[T_IMU] = t_ns
-        auxiliary[HELD_FORCE_B] = auxiliary[FORCE_B] = force_b
-        auxiliary[HELD_RATE_B] = auxiliary[RATE_B] = rate_b
-        still = stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= plan.still_after_ns
-        if still and not _gnss_speed(state) >= plan.filter.course_speed_mps:  # a quiet drive without wheels
-            auxiliary[REST_RATE_B] = auxiliary[MEAN_RATE_B]
-            stamps[T_REST] = t_ns
-    elif model == MODEL["wheel_speed"]:
-        state.memory[source, LAST_VALUE] = values[wheel_speed.SPEED]
-    elif model == MODEL["gnss_position"]:
+    if model == GNSS_POSITION:
         auxiliary[FIX_E] = values[gnss_position.PLACE_E]
         auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
         stamps[T_FIX] = t_ns
         _start_by_position(state, source, plan)
-    elif model == MODEL["gnss_velocity"]:
+    elif model == GNSS_VELOCITY:
         _gather_velocity(state, source, values, plan)
+    else:
+        gather_motion(state, row, plan)
+
+
+@compiled
+def gather_motion(state: FilterState, row: Row, plan: Plan) -> None:
+    """Take in one event that starts nothing: an inertial sample into the means, a wheel's speed for the motion detector."""
+    stamps, a, values = state.stamps, state.auxiliary, row["values"]
+    t_ns, source = int(row["t_ns"]), int(row["source"])
+    stamps[T] = t_ns
+    if plan.models[source] == WHEEL_SPEED:
+        state.memory[source, LAST_SPEED] = values[wheel_speed.SPEED]
+    if plan.models[source] != IMU:
+        return
+    arrive(state.memory[source], state.source_stamps[source], values, t_ns)
+    if stamps[T_IMU] != NEVER:
+        watch(state, values[0:3], values[3:6], (t_ns - stamps[T_IMU]) * 1e-9, plan)
+    stamps[T_IMU] = t_ns
+    for i in range(3):
+        a[HELD_FORCE_B.start + i] = a[FORCE_B.start + i] = values[i]
+        a[HELD_RATE_B.start + i] = a[RATE_B.start + i] = values[3 + i]
+    still = stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= plan.still_after_ns
+    if still and not _gnss_speed(state) >= plan.course_speed:  # a quiet drive without wheels
+        a[REST_RATE_B] = a[MEAN_RATE_B]
+        stamps[T_REST] = t_ns
 
 
 def _start_by_position(state: FilterState, source: int, plan: Plan) -> None:
     """Start at rest; or, where no GNSS velocity is to be had, in a motion that only its bound is known of."""
     speed = _gnss_speed(state)
-    if not _leveled(state) or speed >= plan.filter.course_speed_mps:
+    if not _leveled(state) or speed >= plan.course_speed:
         return
     if _rests(state, plan):
         _start(state, source, None, plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, plan)
@@ -129,16 +153,16 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
     stamps, auxiliary = state.stamps, state.auxiliary
     velocity_n = values[gnss_velocity.VELOCITY_N]
     window = stamps[T] - stamps[T_FIRST_VELOCITY]
-    if stamps[T_FIRST_VELOCITY] == NEVER or window > WINDOW_MOST_NS:
+    if stamps[T_FIRST_VELOCITY] == NEVER or window > MAX_WINDOW_NS:
         auxiliary[FIRST_VELOCITY_N] = velocity_n
         stamps[T_FIRST_VELOCITY] = stamps[T]
         return
     speed = math.sqrt(square(velocity_n[0]) + square(velocity_n[1]))
     fresh = stamps[T_FIX] != NEVER and stamps[T] - stamps[T_FIX] <= FIX_FRESH_NS
-    if window < WINDOW_LEAST_NS or not fresh or not _leveled(state):
+    if window < MIN_WINDOW_NS or not fresh or not _leveled(state):
         return
     variance, course = values[gnss_velocity.VARIANCE], None
-    if speed >= plan.filter.course_speed_mps:
+    if speed >= plan.course_speed:
         sigma = math.sqrt(variance / square(speed) + square(COURSE_SIGMA))
         course = atan2(velocity_n[1], velocity_n[0]), sigma
     elif stamps[T_STILL] != NEVER:
@@ -153,12 +177,13 @@ def _given(state: FilterState, plan: Plan) -> tuple[float, float] | None:
     return math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
 
 
+@compiled
 def _gnss_speed(state: FilterState) -> float:
     """Horizontal speed [m/s] at the begin of the alignment window; nan where no GNSS velocity came of late."""
     first = state.stamps[T_FIRST_VELOCITY]
-    if first == NEVER or state.stamps[T] - first > WINDOW_MOST_NS:
+    if first == NEVER or state.stamps[T] - first > MAX_WINDOW_NS:
         return math.nan
-    north, east, _ = state.auxiliary[FIRST_VELOCITY_N]
+    north, east = state.auxiliary[FIRST_VELOCITY_N.start], state.auxiliary[FIRST_VELOCITY_N.start + 1]
     return math.sqrt(square(north) + square(east))
 
 
@@ -204,7 +229,7 @@ def _start(
             _place(state.hypothesis(i), source, measured_n, variance, turned, first, plan)
         state.stamps[PHASE] = CHOOSING
     if verdict:
-        state.memory[plan.imu_source, LAST_VALUE] = verdict
+        state.stamps[HOT_START] = verdict
     state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
 
 

@@ -1,142 +1,154 @@
-"""A measurement judged and fused: its health, its noise, its gate, and what a source does that was rejected for too long.
-
-Part of the NumPy twin of the compiled kernel (fusiond.filter.step).
-"""
+"""One measurement judged and fused: its noise, its health, its gate, and the reset where its source was locked out."""
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from fusiond.filter import source_health as health
-from fusiond.filter.measurement_update import correlation_factor, update, whiten
+from fusiond.filter import source_health
+from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried
-from fusiond.filter.observations import MODELS, gnss_velocity, wheel_speed
+from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, observe, wheel_speed
+from fusiond.filter.observations.gnss_velocity import lowest_speed
 from fusiond.filter.observations.model import (
     CLUTTER,
     COMPANION,
     CORRELATION,
-    NOISE_LEAST,
-    NOISE_MOST,
+    NOISE_MAX,
+    NOISE_MIN,
+    RESETS,
     SHARED,
     Observation,
     with_rate_noise,
 )
-from fusiond.filter.parameters import MODEL, Plan
+from fusiond.filter.parameters import Plan
+from fusiond.filter.rows import Row
 from fusiond.filter.state import (
     HEIGHT_OFFSET,
     HEIGHT_OFFSET_ERROR,
     LAST_RATIO,
-    LAST_VALUE,
+    LAST_SPEED,
     NEVER,
-    POSITION,
     POSITION_E,
-    RESETS,
+    RESET_REASON,
+    RESET_SOURCE,
     T_ALIKE,
     T_BACK,
     T_FUSED,
     T_LAST,
     T_POSITION,
     T_REJECTED,
-    VELOCITY,
-    VELOCITY_E,
     FilterState,
+    ResetReason,
 )
-from fusiond.maths.wgs84 import Array, mat_ne
+from fusiond.filter.state import RESETS as RESET_COUNT
+from fusiond.maths.typed import Stamps, Vector, compiled
+from fusiond.maths.wgs84 import mat_ne
 
-BREAK_NS = 5_000_000_000  # rejections further apart are not of one row
+BREAK_NS = 5_000_000_000  # rejections further apart do not belong together
 OUTAGE_NS = 10_000_000_000  # a source silent for longer comes back anew, and is new for as long
 SUSPECT = 6  # times gnss_reset_s, where the receiver's motion is in question
-RESETTABLE = {  # what a source resets that was rejected for too long: error states and nominal states
-    MODEL["gnss_position"]: (POSITION, POSITION_E),
-    MODEL["gnss_velocity"]: (VELOCITY, VELOCITY_E),
-    MODEL["barometric_height"]: (HEIGHT_OFFSET_ERROR, HEIGHT_OFFSET),
-}
-NEAR = 9.0  # test ratio up to which a fix after an outage is believed soon
+NEAR = 9.0  # test ratio up to which a fix after an outage is taken as right soon
 
 
-def shared(state: FilterState, seen: Observation, parameters: Array) -> Observation:
-    """An observation with what it shares with others of its group, and with the gyro's noise on the lever arm."""
-    return with_rate_noise(state, seen._replace(variance=seen.variance * parameters[SHARED]))
+@compiled
+def share_noise(state: FilterState, seen: Observation, parameter: Vector) -> None:
+    """Add to an observation's variance what it shares with others of its group, and the gyro's noise on the lever arm."""
+    for a in range(seen.m):
+        seen.variance[a] *= parameter[SHARED]
+    with_rate_noise(state, seen)
 
 
-def remember(memory: Array, model: int, values: Array) -> None:
-    """What the motion detector wants to know of a source's last reading."""
-    if model == MODEL["wheel_speed"]:
-        memory[LAST_VALUE] = values[wheel_speed.SPEED]
-    elif model == MODEL["gnss_velocity"]:
-        memory[LAST_VALUE] = gnss_velocity.least_speed(values)
+@compiled
+def remember(memory: Vector, model: int, values: Vector) -> None:
+    """Keep what the motion detector wants to know of a source's last reading."""
+    if model == WHEEL_SPEED:
+        memory[LAST_SPEED] = values[wheel_speed.SPEED]
+    elif model == GNSS_VELOCITY:
+        memory[LAST_SPEED] = lowest_speed(values)
 
 
-def factor_of(stamps: NDArray[np.int64], model: int, values: Array, parameters: Array, t_ns: int) -> float:
-    """How much less a reading is worth because its error is like that of the one before."""
-    interval = (t_ns - int(stamps[T_FUSED])) * 1e-9 if stamps[T_FUSED] != NEVER else math.inf
-    return correlation_factor(interval, correlation(model, values, parameters))
+@compiled
+def factor_of(stamps: Stamps, model: int, values: Vector, parameter: Vector, t_ns: int) -> float:
+    """How much less a reading is worth because its error is correlated with that of the one before."""
+    if stamps[T_FUSED] == NEVER:
+        return 1.0
+    return correlation_factor((t_ns - stamps[T_FUSED]) * 1e-9, correlation_of(model, values, parameter))
 
 
-def correlation(model: int, values: Array, parameters: Array) -> float:
-    """Time [s] over which a reading's error stays alike."""
-    return float(values[wheel_speed.ALIKE] if model == MODEL["wheel_speed"] else parameters[CORRELATION])
+@compiled
+def correlation_of(model: int, values: Vector, parameter: Vector) -> float:
+    """Time [s] over which a reading's error stays correlated."""
+    return values[wheel_speed.CORRELATED] if model == WHEEL_SPEED else parameter[CORRELATION]
 
 
-def measure(state: FilterState, row: Any, plan: Plan) -> bool:
+@compiled
+def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
     model, values = plan.models[source], row["values"]
-    parameters, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
-    same, elapsed = health.arrive(memory, stamps, values, t_ns)
+    parameter, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
+    elapsed = source_health.since_last(stamps, t_ns)
+    same = source_health.arrive(memory, stamps, values, t_ns)
     remember(memory, model, values)
-    seen = MODELS[model].observe(state, values, parameters)
-    assert seen is not None, "a source's model always observes"
-    m = len(seen.innovation)
-    predicted = np.einsum("ij,jk,ik->i", seen.jacobian, state.covariance, seen.jacobian)
-    given = shared(state, seen, parameters).variance
-    learnt = given * health.noise_factor(memory, parameters[NOISE_LEAST], parameters[NOISE_MOST])
-    row["innovation"][:m], row["variance"][:m] = seen.innovation, predicted + learnt
-    factor = factor_of(stamps, model, values, parameters, t_ns)
-    if stamps[T_LAST] == NEVER or t_ns - int(stamps[T_LAST]) > OUTAGE_NS:
-        stamps[T_FUSED], stamps[T_BACK] = NEVER, t_ns
-        health.begin(memory)
-    companion = int(parameters[COMPANION])
-    doubtful = disputed(state, source if source in plan.velocities else companion, plan)
-    known = stamps[T_FUSED] != NEVER and health.tells(predicted, learnt) and not doubtful
-    if known and health.is_due(stamps, t_ns, correlation(model, values, parameters)):
-        whitened = whiten(state, seen._replace(variance=learnt))
-        if whitened is not None:
-            health.judge(memory, stamps, health.Judgement(whitened, same, t_ns))
+    seen = Observation(state.size)
+    if not observe(state, model, values, parameter, seen):
+        return False
+    m = seen.m
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    project(state, seen, across, spread)
+    share_noise(state, seen, parameter)
+    given, learnt = np.empty(3), np.empty(3)
+    factor = source_health.noise_factor(memory, parameter[NOISE_MIN], parameter[NOISE_MAX])
+    for a in range(m):
+        given[a] = seen.variance[a]
+        learnt[a] = given[a] * factor
+        row["innovation"][a] = seen.innovation[a]
+        row["variance"][a] = spread[a, a] + learnt[a]
+    weight = factor_of(stamps, model, values, parameter, t_ns)
+    if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
+        stamps[T_FUSED] = NEVER
+        stamps[T_BACK] = t_ns
+        source_health.begin(memory)
+    companion = int(parameter[COMPANION])
+    doubtful = disputed(state, source if model == GNSS_VELOCITY else companion, plan)
     if not doubtful:
-        health.learn(memory, (seen.innovation, given), predicted, elapsed)
-    trusted = health.is_trusted(memory) and (companion < 0 or health.is_trusted(state.memory[companion]))
-    trusted = trusted and not (model == MODEL["wheel_speed"] and carried(state, memory[LAST_VALUE], plan))
-    seen = seen._replace(variance=learnt * health.noisy_factor(memory))
-    ratio, fused = update(state, seen, plan.gates[m], factor, trusted, float(parameters[CLUTTER]))
+        if source_health.is_due(stamps, t_ns, correlation_of(model, values, parameter)):
+            whitened = np.empty(3)
+            known = stamps[T_FUSED] != NEVER and source_health.observes_sensor(spread, learnt, m)
+            if known and whiten(spread, seen.innovation, learnt, m, whitened):
+                source_health.judge(memory, stamps, whitened, m, same, t_ns)
+        source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
+    trusted = source_health.is_trusted(memory) and (companion < 0 or source_health.is_trusted(state.memory[companion]))
+    if model == WHEEL_SPEED and trusted:
+        trusted = not carried(state, memory[LAST_SPEED], plan)
+    noisy = source_health.noisy_factor(memory)
+    for a in range(m):
+        seen.variance[a] = learnt[a] * noisy
+    ratio, fused = update_projected(state, seen, plan.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
     row["ratio"] = memory[LAST_RATIO] = ratio
-    if not fused and model in RESETTABLE and _locked_out(state, source, seen, t_ns, plan):
-        _reset_block(state, seen, model)
-        health.begin(memory)
+    if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, plan):
+        _reset(state, source, seen, int(parameter[RESETS]))
+        source_health.begin(memory)
         fused = True
     if fused:
         stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
         stamps[T_FUSED] = t_ns
-        if model == MODEL["gnss_position"]:
+        if model == GNSS_POSITION:
             state.stamps[T_POSITION] = t_ns
     elif stamps[T_REJECTED] == NEVER:
         stamps[T_REJECTED] = t_ns
     return fused
 
 
-def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, plan: Plan) -> bool:
-    """Whether a GNSS source has been rejected for so long, off alike all the time, that the state is the more likely
-    culprit: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
+@compiled
+def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, plan: Plan) -> bool:
+    """Whether a GNSS source has been rejected for long, with the same error all the time, so that the state is more likely
+    the culprit: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
     and much later for a velocity, or a position whose velocity is not trusted, because the rest of the vehicle then
-    contradicts the receiver's motion, as in a drift-off."""
+    contradicts the receiver's motion, as in a slowly growing spoof."""
     memory, stamps = state.memory[source], state.source_stamps[source]
-    gate = plan.gates[len(seen.innovation)]
-    off = health.moved(memory, seen.innovation, seen.variance, gate)
-    if off or stamps[T_ALIKE] == NEVER or t_ns - int(stamps[T_LAST]) > BREAK_NS:
+    off = source_health.moved(memory, seen.innovation, seen.variance, seen.m, plan.gates[seen.m])
+    if off or stamps[T_ALIKE] == NEVER or t_ns - stamps[T_LAST] > BREAK_NS:
         stamps[T_ALIKE] = t_ns
         return False
     wait = plan.gnss_reset_ns
@@ -144,35 +156,73 @@ def _locked_out(state: FilterState, source: int, seen: Observation, t_ns: int, p
     returns = stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
     if (returns and memory[LAST_RATIO] <= NEAR) or is_carried(state, plan):
         wait = plan.gnss_return_ns
-    elif source in plan.velocities or (companion >= 0 and not health.is_trusted(state.memory[companion])):
+    elif plan.models[source] == GNSS_VELOCITY or (companion >= 0 and not source_health.is_trusted(state.memory[companion])):
         wait = SUSPECT * wait
-    return t_ns - int(stamps[T_ALIKE]) >= wait
+    return t_ns - stamps[T_ALIKE] >= wait
 
 
-def _reset_block(state: FilterState, seen: Observation, model: int) -> None:
-    """Put position or velocity where the receiver says, with the receiver's uncertainty, and count the jump. A barometer
-    puts its own offset where the height says: that is no jump."""
-    block, nominal = RESETTABLE[model]
-    if model == MODEL["barometric_height"]:
+@compiled
+def _reset(state: FilterState, source: int, seen: Observation, block: int) -> None:
+    """Put what a source observes where it says; `block` is the first of those error states. A barometer's is its own
+    offset: that is no jump."""
+    if block == HEIGHT_OFFSET_ERROR.start:
         _reset_offset(state, seen)
         return
-    to_n = mat_ne(state.nominal[POSITION_E])
-    axes = len(seen.innovation)
-    state.nominal[nominal] += to_n[:axes].T @ seen.innovation
-    spread = to_n @ state.covariance[block, block] @ to_n.T
-    spread[:axes, :] = spread[:, :axes] = 0.0
-    spread[:axes, :axes] = np.diag(seen.variance)
-    state.covariance[block, :] = 0.0
-    state.covariance[:, block] = 0.0
-    state.covariance[block, block] = to_n.T @ spread @ to_n
-    state.stamps[RESETS] += 1
+    _reset_block(state, seen, block)
+    state.stamps[RESET_COUNT] += 1
+    state.stamps[RESET_REASON] = ResetReason.SOURCE_RETURNED
+    state.stamps[RESET_SOURCE] = source
 
 
+@compiled
+def _reset_block(state: FilterState, seen: Observation, block: int) -> None:  # noqa: PLR0912 - loops
+    """Put position or velocity, which begin at `block` in the error state as in the nominal one, where the receiver says,
+    with the receiver's uncertainty."""
+    x, p, m = state.nominal, state.covariance, seen.m
+    to_n = mat_ne(x[POSITION_E])
+    half, spread = np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                half[i, j] += to_n[i, k] * p[block + k, block + j]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                spread[i, j] += half[i, k] * to_n[j, k]
+    for i in range(3):
+        for j in range(3):
+            if i < m or j < m:
+                spread[i, j] = seen.variance[i] if i == j else 0.0
+    for i in range(3):
+        for k in range(m):
+            x[block + i] += to_n[k, i] * seen.innovation[k]
+        p[block + i] = 0.0
+        p[:, block + i] = 0.0
+        half[i] = 0.0
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                half[i, j] += to_n[k, i] * spread[k, j]
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                p[block + i, block + j] += half[i, k] * to_n[k, j]
+
+
+@compiled
 def _reset_offset(state: FilterState, seen: Observation) -> None:
-    """The height offset (1,) anew, offset = reading - height, with the covariances that this gives it."""
-    state.nominal[HEIGHT_OFFSET] += seen.innovation
-    state.covariance[HEIGHT_OFFSET_ERROR, :] = state.covariance[:, HEIGHT_OFFSET_ERROR] = 0.0
-    cross = -seen.jacobian @ state.covariance
-    state.covariance[HEIGHT_OFFSET_ERROR, :] = cross
-    state.covariance[:, HEIGHT_OFFSET_ERROR] = cross.T
-    state.covariance[HEIGHT_OFFSET_ERROR, HEIGHT_OFFSET_ERROR] = -cross @ seen.jacobian.T + seen.variance
+    """The height offset anew, offset = reading - height, with the covariances that this gives it."""
+    p, offset = state.covariance, HEIGHT_OFFSET_ERROR.start
+    state.nominal[HEIGHT_OFFSET.start] += seen.innovation[0]
+    p[offset] = 0.0
+    p[:, offset] = 0.0
+    cross = np.zeros(state.size)  # - H P
+    for k in range(state.size):
+        if seen.jacobian[0, k] != 0.0:
+            cross += -seen.jacobian[0, k] * p[k]
+    p[offset] = cross
+    p[:, offset] = cross
+    variance = seen.variance[0]
+    for k in range(state.size):
+        variance += -(cross[k] * seen.jacobian[0, k])
+    p[offset, offset] = variance

@@ -21,169 +21,242 @@ from fusiond.filter.state import (
     VELOCITY_E,
     FilterState,
 )
+from fusiond.maths.linear import dot, mirror
 from fusiond.maths.portable import exp
-from fusiond.maths.rotation import normalised, quaternion_exp, quaternion_multiply, skew
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.rotation import normalised, quaternion_exp, quaternion_multiply
+from fusiond.maths.typed import Covariance, ErrorRows3, ErrorVector, Matrix3, Vector3, compiled
 
-ADDED = (
-    (POSITION_E, POSITION),
-    (VELOCITY_E, VELOCITY),
-    (GYRO_BIAS_B, GYRO_BIAS),
-    (ACCEL_BIAS_B, ACCEL_BIAS),
-)
-
-
-FIELD = 100.0  # sigmas: how wide the field is that clutter is uniform over
-UNIFORM = math.sqrt(2 * math.pi) / FIELD  # its density per axis, in units of N(0; 0, S)
+CLUTTER_FIELD = 100.0  # sigmas: how wide the field is that clutter is uniform over
+CLUTTER_DENSITY = math.sqrt(2 * math.pi) / CLUTTER_FIELD  # its density per axis, in units of N(0; 0, S)
 NEGLIGIBLE = 1e-6  # a reading less likely than this to be the target's changes nothing
+MIN_INTERVAL = 1e-6  # s: readings are not taken as closer
 
 
-def chi_square(probability: float, freedom: int) -> float:
-    """The value that a chi-square variable of `freedom` degrees stays below with `probability` (bisection on its
-    distribution function, Abramowitz and Stegun 26.4.6, in arithmetic that is the same on every machine)."""
-
-    def distribution(x: float) -> float:
-        term, k = (math.sqrt(2 * x / math.pi), 1) if freedom % 2 else (x / 2, 2)  # (x/2)^(k/2) / Gamma(k/2 + 1)
-        total = 0.0
-        while k <= freedom or term > 1e-17 * total:
-            if k >= freedom:
-                total += term
-            k += 2
-            term *= x / k
-        return total * exp(-x / 2)
-
-    low, high = 0.0, 1.0
-    while distribution(high) < probability and high < 1000:
-        high *= 2
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if distribution(middle) < probability else (low, middle)
-    return middle
-
-
+@compiled
 def correlation_factor(interval: float, correlation: float) -> float:
-    """How much a variance must grow so that samples every `interval` [s], whose errors stay alike over `correlation` [s]
+    """How much a variance must grow so that samples every `interval` [s], with errors correlated over `correlation` [s]
     (first-order Gauss-Markov), may be fused as if they were independent: (1 + r) / (1 - r) with r = exp(-dt/tau)."""
-    if correlation <= 0:
+    if not correlation > 0 or interval == math.inf:
         return 1.0
-    alike = exp(-max(interval, 1e-6) / correlation)
-    return (1 + alike) / (1 - alike) if alike < 1 else math.inf
+    same = exp(-max(interval, MIN_INTERVAL) / correlation)
+    if same < 1:
+        return (1 + same) / (1 - same)
+    return math.inf
 
 
-def cholesky(matrix: Array) -> Array | None:
-    """Lower factor (m, m) of a finite, symmetric positive definite matrix; None where it is not."""
-    m = len(matrix)
-    lower = np.zeros((m, m))
+@compiled
+def cholesky(spread: Matrix3, variance: Vector3, factor: float, m: int, lower: Matrix3) -> bool:
+    """Write the lower factor (m, m) of spread + factor * diag(variance) into `lower`. False where that is not finite and
+    positive definite, or a variance is negative."""
     for i in range(m):
         for j in range(i + 1):
-            rest = matrix[i, j] - lower[i, :j] @ lower[j, :j]
+            rest = spread[i, j]
             if i == j:
-                if not 0 < rest < math.inf:
-                    return None
+                rest += factor * variance[i]
+            for k in range(j):
+                rest -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not (variance[i] >= 0 and 0 < rest < math.inf):
+                    return False
                 lower[i, i] = math.sqrt(rest)
             else:
                 lower[i, j] = rest / lower[j, j]
-    return lower
+    return True
 
 
-def solve(lower: Array, right: Array) -> Array:
-    """(lower lower')^-1 right, (m, k)."""
-    m = len(lower)
-    solution = right.copy()
+@compiled
+def project(state: FilterState, seen: Observation, across: ErrorRows3, spread: Matrix3) -> None:
+    """H P into `across` (m, n), H P H' into `spread` (m, m)."""
+    for a in range(seen.m):
+        across[a] = 0.0
+        for k in range(state.size):
+            if seen.jacobian[a, k] != 0.0:
+                across[a] += seen.jacobian[a, k] * state.covariance[k]
+    for a in range(seen.m):
+        for i in range(a + 1):
+            spread[a, i] = spread[i, a] = dot(seen.jacobian[a], across[i])
+
+
+@compiled
+def whiten(spread: Matrix3, innovation: Vector3, variance: Vector3, m: int, whitened: Vector3) -> bool:
+    """Write the innovation in units of its own sigma, L^-1 d with L L' = H P H' + R, into `whitened` (m,). False where that
+    is not positive definite."""
+    lower = np.empty((3, 3))
+    if not cholesky(spread, variance, 1.0, m, lower):
+        return False
     for i in range(m):
-        solution[i] = (solution[i] - lower[i, :i] @ solution[:i]) / lower[i, i]
-    for i in reversed(range(m)):
-        solution[i] = (solution[i] - lower[i + 1 :, i] @ solution[i + 1 :]) / lower[i, i]
-    return solution
+        rest = innovation[i]
+        for k in range(i):
+            rest -= lower[i, k] * whitened[k]
+        whitened[i] = rest / lower[i, i]
+    return True
 
 
-def whiten(state: FilterState, seen: Observation) -> Array | None:
-    """Innovation (m,) in units of its own sigma, L^-1 d with L L' = H P H' + R; None where that is not positive definite."""
-    lower = cholesky(seen.jacobian @ state.covariance @ seen.jacobian.T + np.diag(seen.variance))
-    if lower is None:
-        return None
-    whitened = seen.innovation.copy()
-    for i in range(len(whitened)):
-        whitened[i] = (whitened[i] - lower[i, :i] @ whitened[:i]) / lower[i, i]
-    return whitened
-
-
+@compiled
 def update(
-    state: FilterState,
-    seen: Observation,
-    gate: float,
-    factor: float = 1.0,
-    trusted: bool = True,
-    clutter: float = 0.0,
+    state: FilterState, seen: Observation, gate: float, factor: float = 1.0, trusted: bool = True, clutter: float = 0.0
 ) -> tuple[float, bool]:
     """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1, or it is not trusted. Returns the ratio
     (infinite where S is not positive definite, a variance negative or anything not finite) and whether it was fused.
 
     It is judged by its own variance, and weighed by `factor` times that: a sample whose error it shares with the ones
-    before tells little, but is no less wrong when it is far off. With `clutter`, the share of readings that are anywhere,
+    before is worth little, but is no less wrong when it is far off. With `clutter`, the share of readings that are anywhere,
     there is no gate: see `detection`.
     """
-    innovation, jacobian, variance = seen
-    if not (variance >= 0).all():
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    project(state, seen, across, spread)
+    return update_projected(state, seen, gate, factor, trusted, clutter, across, spread)
+
+
+@compiled
+def update_projected(
+    state: FilterState,
+    seen: Observation,
+    gate: float,
+    factor: float,
+    trusted: bool,
+    clutter: float,
+    across: ErrorRows3,
+    spread: Matrix3,
+) -> tuple[float, bool]:
+    """`update` of an observation that was projected: H P (m, n) and H P H' (m, m)."""
+    m, p = seen.m, state.covariance
+    whitened = np.empty(3)
+    if not whiten(spread, seen.innovation, seen.variance, m, whitened):
         return math.inf, False
-    across = state.covariance @ jacobian.T
-    predicted = jacobian @ across
-    lower = cholesky(predicted + np.diag(variance))
-    if lower is None:
+    distance = 0.0
+    for a in range(m):
+        distance += whitened[a] * whitened[a]
+    ratio = distance / gate
+    if not ratio < math.inf:
         return math.inf, False
-    distance = float(innovation @ solve(lower, innovation.reshape(-1, 1))[:, 0])
-    ratio = distance / gate if distance / gate < math.inf else math.inf
-    if clutter == 0 or ratio == math.inf:
-        share = 1.0 if ratio <= 1 else 0.0
-    else:
-        share = detection(distance, len(innovation), clutter)
-    variance = factor * variance
-    lower = cholesky(predicted + np.diag(variance))
-    if not trusted or share < NEGLIGIBLE or lower is None:
+    if not trusted or (clutter == 0 and not ratio <= 1):
         return ratio, False
-    gain = solve(lower, across.T).T
-    keep = np.eye(state.size) - gain @ jacobian
-    covariance = keep @ state.covariance @ keep.T + (gain * variance) @ gain.T
-    error = gain @ innovation
+    share = 1.0
+    if clutter != 0:
+        share = detection(distance, m, clutter)
+        if share < NEGLIGIBLE:
+            return ratio, False
+    lower = np.empty((3, 3))
+    if not cholesky(spread, seen.variance, factor, m, lower):
+        return ratio, False
+    before = np.empty((state.size, state.size))
     if share < 1:
-        covariance = share * covariance + (1 - share) * state.covariance + share * (1 - share) * np.outer(error, error)
-        error = share * error
-    state.covariance[:] = (covariance + covariance.T) / 2
-    turn_along(state.covariance, error)
+        for i in range(state.size):
+            before[i] = p[i]
+    gain = np.empty((3, state.size))
+    _solve(lower, across, m, gain)
+    _joseph(p, seen, factor, across, gain)
+    error = np.zeros(state.size)
+    for a in range(m):
+        error += seen.innovation[a] * gain[a]
+    if share < 1:
+        mixed = share * (1 - share)
+        for i in range(state.size):
+            p[i] = share * p[i] + (1 - share) * before[i] + mixed * (error[i] * error)
+        error *= share
+    turn_along(p, error)
     inject(state, error)
     return ratio, share >= 0.5
 
 
-def turn_along(covariance: Array, error: Array) -> None:
+@compiled
+def _solve(lower: Matrix3, across: ErrorRows3, m: int, gain: ErrorRows3) -> None:
+    """The gain's transpose K' = S^-1 (P H')' (m, n), with S = lower lower'."""
+    for i in range(m):
+        gain[i] = across[i]
+        for k in range(i):
+            gain[i] += -lower[i, k] * gain[k]
+        gain[i] /= lower[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            gain[i] += -lower[k, i] * gain[k]
+        gain[i] /= lower[i, i]
+
+
+@compiled
+def _joseph(p: Covariance, seen: Observation, factor: float, across: ErrorRows3, gain: ErrorRows3) -> None:
+    """P = (I - K H) P (I - K H)' + K R K', as A = P - K (H P) and P = A - (A H') K' + K R K', by rows."""
+    for a in range(seen.m):
+        p += (-across[a])[:, None] * gain[a]  # of A' = P - (P H') K'
+    kept = np.zeros((3, len(p)))
+    for a in range(seen.m):
+        for k in range(len(p)):
+            if seen.jacobian[a, k] != 0.0:
+                kept[a] += -seen.jacobian[a, k] * p[k]
+    for a in range(seen.m):
+        kept[a] += factor * seen.variance[a] * gain[a]
+    for a in range(seen.m):
+        p += gain[a][:, None] * kept[a]
+    mirror(p)
+
+
+@compiled
+def turn_along(p: Covariance, error: ErrorVector) -> None:
     """Let an attitude error turn the corrections of position and velocity along: P = M P M' with -[correction]x in M's
     blocks of position and velocity by attitude, for a correction (n,).
 
     So the error is that of an invariant filter (Barrau and Bonnabel 2017), true velocity = exp([phi]x) velocity + error: a
-    heading that nothing tells of stays as uncertain as it is. Without this each correction of the velocity would turn the
+    heading that nothing observes stays as uncertain as it is. Without this each correction of the velocity would turn the
     direction in which the heading cannot be seen, and the filter would take that for knowledge.
     """
-    for block in (POSITION, VELOCITY):
-        covariance[block] -= skew(error[block]) @ covariance[ATTITUDE]
-    for block in (POSITION, VELOCITY):
-        covariance[:, block] -= covariance[:, ATTITUDE] @ skew(error[block]).T
-    upper = np.triu(covariance)
-    covariance[:] = upper + np.triu(covariance, 1).T
+    turned = np.empty((6, len(p)))
+    phi = ATTITUDE.start
+    for block in range(0, 6, 3):  # position, velocity
+        turned[block] = error[block + 1] * p[phi + 2] - error[block + 2] * p[phi + 1]
+        turned[block + 1] = error[block + 2] * p[phi] - error[block] * p[phi + 2]
+        turned[block + 2] = error[block] * p[phi + 1] - error[block + 1] * p[phi]
+    for i in range(6):
+        p[i] += -1.0 * turned[i]
+    for block in range(0, 6, 3):
+        for i in range(6):  # the others are mirrored
+            x, y, z = p[i, phi], p[i, phi + 1], p[i, phi + 2]
+            p[i, block] -= error[block + 1] * z - error[block + 2] * y
+            p[i, block + 1] -= error[block + 2] * x - error[block] * z
+            p[i, block + 2] -= error[block] * y - error[block + 1] * x
+    mirror(p)
 
 
+@compiled
 def detection(distance: float, m: int, clutter: float) -> float:
     """Probability that a reading is the target's and not clutter (THEORY D3): P_D N(d; 0, S) against (1 - P_D) rho, with
-    P_D = 1 - clutter and rho uniform over a field of `FIELD` sigmas along each axis of S. The update is then the mixture
-    of updated and predicted state, collapsed by its moments (B6)."""
+    P_D = 1 - clutter and rho uniform over a field of CLUTTER_FIELD sigmas along each axis of S. The update is then the
+    mixture of updated and predicted state, collapsed by its moments (B6)."""
     density, uniform = (1 - clutter) * exp(-distance / 2), clutter
-    for _ in range(m):
-        uniform *= UNIFORM
+    for _a in range(m):
+        uniform *= CLUTTER_DENSITY
     return density / (density + uniform)
 
 
-def inject(state: FilterState, error: Array) -> None:
+@compiled
+def inject(state: FilterState, error: ErrorVector) -> None:
     """Add an error (n,) to the nominal state: true = nominal (+) error. The covariance is left as it is: the turn of the
     attitude error's axes by half the correction (Sola 2017, 6.3) is of the second order."""
     x = state.nominal
-    for nominal, block in ADDED:
-        x[nominal] += error[block]
-    x[CALIBRATIONS + 1 : state.size + 1] += error[CALIBRATIONS:]
+    x[POSITION_E] += error[POSITION]
+    x[VELOCITY_E] += error[VELOCITY]
+    x[GYRO_BIAS_B] += error[GYRO_BIAS]
+    x[ACCEL_BIAS_B] += error[ACCEL_BIAS]
+    for i in range(CALIBRATIONS, state.size):
+        x[i + 1] += error[i]
     x[QUATERNION_EB] = normalised(quaternion_multiply(quaternion_exp(error[ATTITUDE]), x[QUATERNION_EB]))
+
+
+@compiled
+def difference(one: FilterState, other: FilterState) -> ErrorVector:
+    """The error (n,) that carries the other state into the one; the rotation to the second order."""
+    a, b = one.nominal, other.nominal
+    error = np.empty(one.size)
+    error[POSITION] = a[POSITION_E] - b[POSITION_E]
+    error[VELOCITY] = a[VELOCITY_E] - b[VELOCITY_E]
+    error[GYRO_BIAS] = a[GYRO_BIAS_B] - b[GYRO_BIAS_B]
+    error[ACCEL_BIAS] = a[ACCEL_BIAS_B] - b[ACCEL_BIAS_B]
+    for i in range(CALIBRATIONS, one.size):
+        error[i] = a[i + 1] - b[i + 1]
+    q = QUATERNION_EB.start
+    back = np.array([b[q], -b[q + 1], -b[q + 2], -b[q + 3]])
+    turn = quaternion_multiply(a[QUATERNION_EB], back)
+    twice = 2.0 if turn[0] >= 0 else -2.0
+    for i in range(3):
+        error[ATTITUDE.start + i] = turn[1 + i] * twice
+    return error

@@ -1,7 +1,6 @@
 """The state in north-east-down: the numbers that are published, worked out from the earth-fixed ones of the filter.
 
-Part of the NumPy twin of the compiled kernel (fusiond.filter.step), which does the same a hundred times faster: it is done
-for every publication. Rotation matrix to quaternion: Shepperd (1978), in fusiond.maths.rotation.
+Rotation matrix to quaternion: Shepperd (1978), in fusiond.maths.rotation.
 """
 
 from __future__ import annotations
@@ -9,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from fusiond.filter.state import ATTITUDE, POSITION, POSITION_E, QUATERNION_EB, VELOCITY, VELOCITY_E
-from fusiond.maths.rotation import matrix, product, quaternion
-from fusiond.maths.wgs84 import Array, geodetic, mat_ne
+from fusiond.maths.rotation import matrix, matrix_product, quaternion, times
+from fusiond.maths.typed import Answer, Covariance, Vector, compiled
+from fusiond.maths.wgs84 import geodetic, mat_ne
 
 # Slices of what `answer` returns
 GEODETIC = slice(0, 3)  # latitude, longitude [rad], height [m]
@@ -18,18 +18,30 @@ VELOCITY_N = slice(3, 6)  # m/s
 QUATERNION_NB = slice(6, 10)  # w >= 0
 COVARIANCE_N = slice(10, 91)  # (9, 9): position, velocity, attitude, each north, east, down
 ANSWER_SIZE = 91
-BLOCKS = (POSITION, VELOCITY, ATTITUDE)
+BLOCKS = (POSITION, VELOCITY, ATTITUDE)  # of the error state, in this order from its begin
 
 
-def answer(nominal: Array, covariance: Array) -> Array:
+@compiled
+def answer(nominal: Vector, covariance: Covariance) -> Answer:
     """The state (91,) in north-east-down, of a nominal state and its covariance (n, n); slices as above."""
-    to_n = mat_ne(nominal[POSITION_E])
     found = np.empty(ANSWER_SIZE)
-    found[GEODETIC] = geodetic(nominal[POSITION_E])
-    found[VELOCITY_N] = product(to_n, nominal[VELOCITY_E])
-    found[QUATERNION_NB] = quaternion(product(to_n, matrix(nominal[QUATERNION_EB])))
-    turned = found[COVARIANCE_N].reshape(9, 9)
-    for rows in BLOCKS:
-        for columns in BLOCKS:
-            turned[rows, columns] = product(product(to_n, covariance[rows, columns]), to_n.T)
+    to_n = mat_ne(nominal[POSITION_E])
+    found[0], found[1], found[2] = geodetic(nominal[POSITION_E])
+    found[VELOCITY_N] = times(to_n, nominal[VELOCITY_E])
+    found[QUATERNION_NB] = quaternion(matrix_product(to_n, matrix(nominal[QUATERNION_EB])))
+    turned = np.empty((3, 3))
+    for a in range(0, 9, 3):
+        for b in range(0, 9, 3):  # one block of the covariance, turned from both sides
+            for i in range(3):
+                for j in range(3):
+                    turned[i, j] = (
+                        to_n[i, 0] * covariance[a, b + j]
+                        + to_n[i, 1] * covariance[a + 1, b + j]
+                        + to_n[i, 2] * covariance[a + 2, b + j]
+                    )
+            for i in range(3):
+                for j in range(3):
+                    found[COVARIANCE_N.start + 9 * (a + i) + b + j] = (
+                        turned[i, 0] * to_n[j, 0] + turned[i, 1] * to_n[j, 1] + turned[i, 2] * to_n[j, 2]
+                    )
     return found

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from fusiond.config.schema import Config, Filter, Gnss, Imu, Motion, Wheel, calibrated, wheel_groups
-from fusiond.filter.measurement_update import chi_square, correlation_factor
-from fusiond.filter.observations import CONSTRAINTS, MODELS, wheel_speed
-from fusiond.filter.observations.model import CLUTTER, COMPANION, NOISE_LEAST, NOISE_MOST, PARAMETERS, SHARED
+from fusiond.config.schema import Config, Filter, Gnss, Imu, Wheel, calibrated, wheel_groups
+from fusiond.filter.measurement_update import correlation_factor
+from fusiond.filter.observations import CONSTRAINTS, IMU, MODEL, MODELS, wheel_speed
+from fusiond.filter.observations.model import CLUTTER, COMPANION, NOISE_MAX, NOISE_MIN, SHARED, empty_row
 from fusiond.filter.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
@@ -26,12 +26,11 @@ from fusiond.filter.state import (
 from fusiond.filter.stored_state import StoredState
 from fusiond.filter.strapdown import ProcessNoise
 from fusiond.maths.portable import square
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.statistics import chi_square
+from fusiond.maths.typed import Array
 
-IMU = -1  # stands for the inertial sensor in a row's `model`
-MODEL = {model.name: number for number, model in enumerate(MODELS)}
 SECOND = 1_000_000_000  # ns
-CREEPING_ALIKE = 1.0  # s: for so long a vehicle that creeps unseen keeps its speed
+CREEPING_TIME = 1.0  # s, over which a vehicle that creeps unseen keeps its speed
 
 
 def nanoseconds(seconds: float) -> int:
@@ -61,20 +60,24 @@ class Plan:
     heading_variance: float  # rad^2: the spread of the headings at which the bank is collapsed
     constraint_interval_ns: int
     still_after_ns: int
+    standstill: bool  # detect it
+    still_wheel: float  # m/s
     still_gyro: float  # rad/s
+    still_accel: float  # m/s^2
+    non_holonomic: bool
+    course_speed: float  # m/s
     zero_velocity_factor: float  # creeping stays alike: weighs zero velocities down
     filter: Filter
-    motion: Motion
     imu: Imu
     stored: StoredState | None  # of an earlier run, for a hot start
-    stored_most_ns: int  # how old it may be
+    max_stored_age_ns: int
 
 
 def section_of(source: str, model: int, config: Config) -> Any:
     """The table of the configuration that a source stands in."""
     if model == IMU:
         return config.imu[source]
-    table: dict[str, Any] = getattr(config, MODELS[model].table or "")
+    table: dict[str, Any] = getattr(config, MODELS[model].table)
     return table[source.removesuffix(MODELS[model].suffix)]
 
 
@@ -82,8 +85,7 @@ def plan(config: Config, stored: StoredState | None = None) -> Plan:
     """Lay a configuration out for the kernel, with what an earlier run has stored."""
     found = dict.fromkeys(config.imu, IMU)
     for number, model in enumerate(MODELS):
-        if model.table is not None:
-            found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
+        found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
     sources = tuple(sorted(found))
     models = tuple(found[source] for source in sources)
     rows = [_parameters(source, sources, model, config) for source, model in zip(sources, models, strict=True)]
@@ -118,24 +120,28 @@ def plan(config: Config, stored: StoredState | None = None) -> Plan:
         heading_variance=square(math.radians(settings.heading_spread_deg)),
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),
+        standstill=motion.standstill,
+        still_wheel=motion.still_wheel_mps,
         still_gyro=math.radians(motion.still_gyro_deg_s),
-        zero_velocity_factor=correlation_factor(motion.interval_s, CREEPING_ALIKE),
+        still_accel=motion.still_accel_mps2,
+        non_holonomic=motion.non_holonomic,
+        course_speed=settings.course_speed_mps,
+        zero_velocity_factor=correlation_factor(motion.interval_s, CREEPING_TIME),
         filter=settings,
-        motion=motion,
         imu=imu,
         stored=stored,
-        stored_most_ns=nanoseconds(config.state.max_age_s),
+        max_stored_age_ns=nanoseconds(config.state.max_age_s),
     )
 
 
 def _parameters(source: str, sources: tuple[str, ...], model: int, config: Config) -> Array:
     """The row of one source: what its model wants, and what all have."""
     if model == IMU:
-        return np.zeros(PARAMETERS)
+        return empty_row()
     section = section_of(source, model, config)
     row = MODELS[model].parameters(section)
-    row[NOISE_LEAST], row[NOISE_MOST] = square(section.noise_least), square(section.noise_most)
-    row[SHARED], row[COMPANION] = _shared(section, model, config), -1
+    row[NOISE_MIN], row[NOISE_MAX] = square(section.noise_least), square(section.noise_most)
+    row[SHARED] = _shared(section, model, config)
     if model == MODEL["wheel_speed"]:
         row[wheel_speed.SCALE_STATE] = scale_state(wheel_groups(config)[source])
     if not isinstance(section, Gnss):

@@ -11,10 +11,9 @@ Nothing is certain after one sample: every hypothesis expects an outlier now and
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.filter.state import (
     BELIEF,
@@ -34,32 +33,32 @@ from fusiond.filter.state import (
     T_LAST,
 )
 from fusiond.maths.portable import exp
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array, Matrix3, Stamps, Vector, Vector3, compiled
 
 JUDGE_NS = 50_000_000  # samples closer than this share their error
-KEEPS = 20.0  # s: for so long a source stays what it is
+KEEPS = 20.0  # s: how long a source stays what it is
 PRIOR = (0.997, 0.001, 0.001, 0.001)  # nominal, noisy, biased, frozen: what it becomes then
 OUTLIERS = 0.01  # share of readings that are off whatever the source is
 OUTLIER_VARIANCE = 100.0  # of such a reading, per axis, in units of S
 NOISY_VARIANCE = 16.0  # of a noisy source's innovation, likewise
 FIRST_BIAS_VARIANCE = 100.0  # of a biased source's bias, likewise
 BIAS_WALK = 0.01  # how fast a bias changes: variance added at each sample
-FARTHEST = 1000.0  # a squared innovation beyond is no stranger than this: no likelihood vanishes
-LEAST_BIAS = 3.0  # a smaller bias, in sigmas, is not called one
+MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this: no likelihood vanishes
+MIN_BIAS = 3.0  # a smaller bias, in sigmas, is not called one
 SAME_IF_NOMINAL = 1 / 3  # chance that a good sensor repeats a reading to the bit
 SAME_IF_FAULTY = 1 / 20  # chance that a noisy or biased one does
 OTHER_IF_FROZEN = 1e-3  # chance that a frozen one does not
 TELLING = 4.0  # times the sensor's own variance: what more than that has told is the state, not the sensor
 NOTED = 0.1  # a source that is noisy with at most this probability is taken as it is
-NOTHING = np.zeros(0)
 DISTRUST = 0.5  # a source that is biased or frozen with more than this probability is not fused
 ABSENT = 1e-3  # chance that a source that was heard a moment ago has gone
 DETECTION = 0.9  # chance that an expected reading comes
-MOST_MISSES = 30
+MAX_MISSES = 30
 UNKNOWN_INTERVAL = 1.0  # s, where a source was never heard
 CHANCE = 0.2  # learnt noise that differs by less than this share from the given is the same
 NOISE_TIME = 30.0  # s, over which noise is learnt
 CLIPPED = 25.0  # a squared innovation counts for at most so many times its variance: outliers are not noise
+MAX_INTERVAL = 10.0  # s: a longer pause counts as this in the mean spacing
 INTERVAL_SHARE = 0.05  # weight of the newest interval in the mean
 NIS_TIME = 10.0  # s, over which the mean of the normalised innovation squared is taken
 
@@ -75,82 +74,88 @@ class Belief(NamedTuple):
 STATUSES = ("nominal", "noisy", "biased", "frozen", "absent")
 
 
-class Judgement(NamedTuple):
-    """One look at a source: whitened innovation (m,), whether the reading repeats the one before, and when."""
-
-    whitened: Array
-    same: bool
-    t_ns: int
-
-
-def begin(memory: Array) -> None:
-    """What is believed of a source of which nothing is known yet."""
-    memory[BELIEF] = PRIOR
+@compiled
+def begin(memory: Vector) -> None:
+    """Know nothing of a source yet."""
+    for i in range(4):
+        memory[NOMINAL + i] = PRIOR[i]
     memory[BIAS] = 0.0
     memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
 
 
-def tells(predicted: Array, variance: Array) -> bool:
-    """Whether an innovation tells of the sensor: H P H' and R, (m,) each, the one not far above the other. A state that is
-    uncertain, after an outage, is off alike at every look."""
+@compiled
+def observes_sensor(spread: Matrix3, variance: Vector3, m: int) -> bool:
+    """Whether an innovation says something about the sensor: H P H' (m, m) and R (m,), the one not far above the other. A
+    state that is uncertain, after an outage, is off in the same way at every look."""
     total = own = 0.0
-    for a in range(len(variance)):
-        total += predicted[a]
+    for a in range(m):
+        total += spread[a, a]
         own += variance[a]
     return total <= TELLING * own
 
 
-def judge_repetition(memory: Array, stamps: NDArray[np.int64], same: bool, t_ns: int) -> None:
-    """The same for a source without innovations, the inertial sensor: only a frozen one shows."""
+@compiled
+def judge_repetition(memory: Vector, stamps: Stamps, same: bool, t_ns: int) -> None:
+    """Judge a source without innovations, the inertial sensor: only a frozen one shows."""
     if is_due(stamps, t_ns, 0.0):
-        judge(memory, stamps, Judgement(NOTHING, same, t_ns))
+        nothing = np.zeros(3)
+        judge(memory, stamps, nothing, 0, same, t_ns)
 
 
-def is_due(stamps: NDArray[np.int64], t_ns: int, correlation: float) -> bool:
-    """Whether enough time has passed since the last look for a new one to tell something new."""
-    return bool(stamps[T_JUDGED] == NEVER or t_ns - stamps[T_JUDGED] >= max(JUDGE_NS, int(2e9 * correlation)))
+@compiled
+def is_due(stamps: Stamps, t_ns: int, correlation: float) -> bool:
+    """Whether enough time has passed since the last look for a new one to be independent of it."""
+    pause = int(2e9 * correlation)
+    return stamps[T_JUDGED] == NEVER or t_ns - stamps[T_JUDGED] >= max(JUDGE_NS, pause)
 
 
-def judge(memory: Array, stamps: NDArray[np.int64], look: Judgement) -> None:
-    """Bayes' rule for one source (D1), after the passage of time has blurred what was believed."""
+@compiled
+def judge(memory: Vector, stamps: Stamps, whitened: Vector3, m: int, same: bool, t_ns: int) -> None:
+    """Bayes' rule for one source (THEORY D1), after the passage of time has blurred its probabilities: by the whitened
+    innovation (m,), and whether the reading repeats the one before to the bit."""
     if memory[NOMINAL] + memory[NOISY] + memory[BIASED] + memory[FROZEN] == 0:
         begin(memory)
-    elapsed = KEEPS if stamps[T_JUDGED] == NEVER else (look.t_ns - int(stamps[T_JUDGED])) * 1e-9
-    stamps[T_JUDGED] = look.t_ns
+    elapsed = KEEPS
+    if stamps[T_JUDGED] != NEVER:
+        elapsed = (t_ns - stamps[T_JUDGED]) * 1e-9
+    stamps[T_JUDGED] = t_ns
     blurred = 1 - exp(-elapsed / KEEPS)
+    _renew_bias(memory, whitened, m)
+    nominal, noisy, biased, frozen = likelihoods(memory, whitened, m, same)
+    memory[NOMINAL] = (memory[NOMINAL] + blurred * (PRIOR[0] - memory[NOMINAL])) * nominal
+    memory[NOISY] = (memory[NOISY] + blurred * (PRIOR[1] - memory[NOISY])) * noisy
+    memory[BIASED] = (memory[BIASED] + blurred * (PRIOR[2] - memory[BIASED])) * biased
+    memory[FROZEN] = (memory[FROZEN] + blurred * (PRIOR[3] - memory[FROZEN])) * frozen
     total = 0.0
-    _renew_bias(memory, look.whitened)
-    for i, likelihood in enumerate(likelihoods(memory, look.whitened, look.same)):
-        place = NOMINAL + i
-        memory[place] = (memory[place] + blurred * (PRIOR[i] - memory[place])) * likelihood
-        total += memory[place]
-    for i in range(len(PRIOR)):
+    for i in range(4):
+        total += memory[NOMINAL + i]
+    for i in range(4):
         memory[NOMINAL + i] = memory[NOMINAL + i] / total
-    _follow_bias(memory, look.whitened)
+    _follow_bias(memory, whitened, m)
 
 
-def likelihoods(memory: Array, whitened: Array, same: bool) -> tuple[float, float, float, float]:
+@compiled
+def likelihoods(memory: Vector, whitened: Vector3, m: int, same: bool) -> tuple[float, float, float, float]:
     """Of the four hypotheses, up to a common factor (2 pi)^(-m/2)."""
-    m = len(whitened)
     square = off = 0.0
-    stretch, variance = _stretch(memory, m), 1 + memory[BIAS_VARIANCE]
+    stretch = _stretch(memory, m)
     for a in range(m):
         square += whitened[a] * whitened[a]
         rest = whitened[a] - memory[BIAS.start + a] * stretch
         off += rest * rest
-    square = min(square, FARTHEST)
+    square = min(square, MAX_SQUARE)
     outlier = _density(square, OUTLIER_VARIANCE, m)
     good = (1 - OUTLIERS) * _density(square, 1.0, m) + OUTLIERS * outlier
     noisy = (1 - OUTLIERS) * _density(square, NOISY_VARIANCE, m) + OUTLIERS * outlier
-    biased = (1 - OUTLIERS) * _density(off, variance, m) + OUTLIERS * outlier
+    biased = (1 - OUTLIERS) * _density(off, 1 + memory[BIAS_VARIANCE], m) + OUTLIERS * outlier
     if not same:
         return good, noisy, biased, outlier * OTHER_IF_FROZEN
     return good * SAME_IF_NOMINAL, noisy * SAME_IF_FAULTY, biased * SAME_IF_FAULTY, outlier
 
 
-def _renew_bias(memory: Array, whitened: Array) -> None:
+@compiled
+def _renew_bias(memory: Vector, whitened: Vector3, m: int) -> None:
     """Forget the bias where a new one, of which nothing is known, explains the innovation better."""
-    m = len(whitened)
     square = off = 0.0
     for a in range(m):
         square += whitened[a] * whitened[a]
@@ -161,92 +166,109 @@ def _renew_bias(memory: Array, whitened: Array) -> None:
         memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
 
 
+@compiled
 def _density(square: float, variance: float, m: int) -> float:
     """exp(-square / 2 variance) / variance^(m/2)"""
     root = math.sqrt(variance)
     scale = 1.0
-    for _ in range(m):
+    for _a in range(m):
         scale *= root
     return exp(-square / (2 * variance)) / scale
 
 
-def _stretch(memory: Array, m: int) -> float:
-    """What takes a bias that is too small to be called one to the least that is; as it is while it is not known."""
+@compiled
+def _stretch(memory: Vector, m: int) -> float:
+    """What takes a bias that is too small to be called one to the least that is; 1 while it is not known."""
     if memory[BIAS_VARIANCE] >= 1.0:
         return 1.0
     size = 0.0
     for a in range(m):
         size += memory[BIAS.start + a] * memory[BIAS.start + a]
     size = math.sqrt(size)
-    return LEAST_BIAS / size if 1e-9 < size < LEAST_BIAS else 1.0
+    return MIN_BIAS / size if 1e-9 < size < MIN_BIAS else 1.0
 
 
-def _follow_bias(memory: Array, whitened: Array) -> None:
+@compiled
+def _follow_bias(memory: Vector, whitened: Vector3, m: int) -> None:
     """A scalar Kalman filter for each axis of the bias, all of one variance."""
     variance = memory[BIAS_VARIANCE] + BIAS_WALK
     gain = variance / (variance + 1)
-    for a in range(len(whitened)):
+    for a in range(m):
         memory[BIAS.start + a] += gain * (whitened[a] - memory[BIAS.start + a])
     memory[BIAS_VARIANCE] = (1 - gain) * variance
 
 
-def is_trusted(memory: Array) -> bool:
+@compiled
+def is_trusted(memory: Vector) -> bool:
     """Whether a source is fused at all."""
-    return bool(memory[BIASED] + memory[FROZEN] <= DISTRUST)
+    return memory[BIASED] + memory[FROZEN] <= DISTRUST
 
 
-def noise_factor(memory: Array, least: float, most: float) -> float:
+@compiled
+def noise_factor(memory: Vector, lowest: float, highest: float) -> float:
     """By what a source's configured variance is multiplied: as learnt, within bounds; a little more or less is chance."""
-    excess = float(memory[NOISE_EXCESS])
-    beyond = max(0.0, excess - CHANCE) + min(0.0, excess + CHANCE)
-    return min(max(1 + beyond, least), most)
+    beyond = 0.0
+    if memory[NOISE_EXCESS] > CHANCE:
+        beyond = memory[NOISE_EXCESS] - CHANCE
+    elif memory[NOISE_EXCESS] < -CHANCE:
+        beyond = memory[NOISE_EXCESS] + CHANCE
+    return min(max(1 + beyond, lowest), highest)
 
 
-def noisy_factor(memory: Array) -> float:
-    """And by what besides, by the probability that it is noisy: nothing while that is small."""
-    return float(1 + (NOISY_VARIANCE - 1) * memory[NOISY]) if memory[NOISY] > NOTED else 1.0
+@compiled
+def noisy_factor(memory: Vector) -> float:
+    """And by what besides, by the probability that it is noisy: 1 while that is small."""
+    return 1 + (NOISY_VARIANCE - 1) * memory[NOISY] if memory[NOISY] > NOTED else 1.0
 
 
-def learn(memory: Array, seen: tuple[Array, Array], predicted: Array, elapsed: float) -> None:
-    """Noise from innovations (THEORY C3): the mean of d^2 - H P H', as a multiple of the configured variance. `seen` is
-    innovation and configured variance, `predicted` the diagonal of H P H', all (m,)."""
-    innovation, variance = seen
-    found = configured = 0.0
-    nis = 0.0
-    m = len(innovation)
+@compiled
+def learn(memory: Vector, innovation: Vector3, variance: Vector3, spread: Matrix3, m: int, elapsed: float) -> None:
+    """Noise from innovations (THEORY C3): the mean of d^2 - H P H', as a multiple of the configured variance (m,), with
+    H P H' (m, m) and `elapsed` [s] since the last one."""
+    found = configured = nis = 0.0
     for a in range(m):
-        square, spread = innovation[a] * innovation[a], predicted[a] + variance[a]
-        nis += square / spread
-        found += min(square, CLIPPED * spread) - predicted[a]
+        square, expected = innovation[a] * innovation[a], spread[a, a] + variance[a]
+        nis += square / expected
+        found += min(square, CLIPPED * expected) - spread[a, a]
         configured += variance[a]
     memory[MEAN_NIS] += elapsed / (NIS_TIME + elapsed) * (nis / m - memory[MEAN_NIS])
     if configured > 0:
         memory[NOISE_EXCESS] += elapsed / (NOISE_TIME + elapsed) * (found / configured - 1 - memory[NOISE_EXCESS])
 
 
-def arrive(memory: Array, stamps: NDArray[np.int64], values: Any, t_ns: int) -> tuple[bool, float]:
-    """Note a reading: whether it repeats the one before to the bit, and the time since [s]."""
-    total = float(values[0]) + float(values[1]) + float(values[2])
+@compiled
+def since_last(stamps: Stamps, t_ns: int) -> float:
+    """Time since a source's last reading [s]; 0 for the first."""
+    if stamps[T_LAST] == NEVER:
+        return 0.0
+    return (t_ns - stamps[T_LAST]) * 1e-9
+
+
+@compiled
+def arrive(memory: Vector, stamps: Stamps, values: Vector, t_ns: int) -> bool:
+    """Note a reading. Returns whether it repeats the one before to the bit."""
+    total = values[0] + values[1] + values[2]
     same = stamps[T_LAST] != NEVER and total == memory[LAST_SUM]
     memory[LAST_SUM] = total
-    elapsed = 0.0 if stamps[T_LAST] == NEVER else (t_ns - int(stamps[T_LAST])) * 1e-9
+    elapsed = since_last(stamps, t_ns)
     if elapsed > 0:
         share = INTERVAL_SHARE if memory[INTERVAL] > 0 else 1.0
-        memory[INTERVAL] += share * (min(elapsed, 10.0) - memory[INTERVAL])
-    return bool(same), elapsed
+        memory[INTERVAL] += share * (min(elapsed, MAX_INTERVAL) - memory[INTERVAL])
+    return same
 
 
-def moved(memory: Array, innovation: Array, variance: Array, gate: float) -> bool:
+@compiled
+def moved(memory: Vector, innovation: Vector3, variance: Vector3, m: int, gate: float) -> bool:
     """Whether the error of a rejected reading differs by more than noise from that of the one before; notes it."""
     total = 0.0
-    for a in range(len(innovation)):
+    for a in range(m):
         step = innovation[a] - memory[LAST_INNOVATION.start + a]
         total += step * step / (2 * variance[a])
         memory[LAST_INNOVATION.start + a] = innovation[a]
     return not total <= gate
 
 
-def belief(memory: Array, stamps: NDArray[np.int64], t_ns: int, since_ns: int) -> Belief:
+def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int) -> Belief:
     """What is believed of a source at `t_ns`, of which the filter has run since `since_ns`.
 
     Absent (THEORY D2): with detection probability P_D, each expected reading that is missing has likelihood 1 - P_D.
@@ -255,7 +277,7 @@ def belief(memory: Array, stamps: NDArray[np.int64], t_ns: int, since_ns: int) -
     age = (t_ns - max(int(stamps[T_LAST]), since_ns)) * 1e-9
     expected = memory[INTERVAL] if memory[INTERVAL] > 0 else UNKNOWN_INTERVAL
     odds = ABSENT / (1 - ABSENT)
-    for _ in range(min(int(age / expected), MOST_MISSES)):
+    for _ in range(min(int(age / expected), MAX_MISSES)):
         odds /= 1 - DETECTION
     absent = odds / (1 + odds)
     nominal, noisy, biased, frozen = (float(p) * (1 - absent) for p in kept)

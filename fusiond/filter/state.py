@@ -8,12 +8,11 @@ other. North-east-down is made where people and messages want it (`fusiond.estim
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import numpy as np
-from numpy.typing import NDArray
 
-from fusiond.maths.wgs84 import Array
-
-Stamps = NDArray[np.int64]
+from fusiond.maths.typed import Array, Stamps
 
 # Nominal state: slices of FilterState.nominal
 POSITION_E = slice(0, 3)  # m, of the IMU, earth-fixed
@@ -65,8 +64,7 @@ SMOOTH_FORCE_B = slice(36, 39)  # m/s^2, mean over the delays of receivers
 AUXILIARY_SIZE = 39
 
 # Remembered of each source: columns of FilterState.memory
-LAST_VALUE = 0  # last reading of a wheel [m/s]; of a GNSS velocity, the least horizontal speed that it leaves possible;
-# of the inertial sensor, what became of the stored state (fusiond.filter.hot_start.Verdict)
+LAST_SPEED = 0  # m/s, last reading of a wheel; of a GNSS velocity, the lowest horizontal speed that it leaves possible
 LAST_RATIO = 1  # test ratio of the last update
 NOISE_EXCESS = 2  # learnt variance over the configured one, less 1
 BELIEF = slice(3, 7)  # probabilities (fusiond.filter.source_health); all 0 before the first look
@@ -94,7 +92,10 @@ RESETS = 10  # count of jumps of the state
 CONSTRAINT_FUSED = slice(11, 14)  # counts: non-holonomic, zero velocity, zero rotation
 CONSTRAINT_REJECTED = slice(14, 17)
 BLOWN = 17  # count of restarts because the state was no longer finite
-STAMPS_SIZE = 18
+RESET_REASON = 18  # of the last jump: ResetReason
+RESET_SOURCE = 19  # index of the source behind it, where there is one
+HOT_START = 20  # what became of the stored state: Verdict
+STAMPS_SIZE = 21
 
 # And of each source: columns of FilterState.source_stamps
 T_LAST = 0  # ns, of its last event
@@ -109,6 +110,31 @@ EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
 HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.filter.heading_bank): twelve all round, and a stored one
 STORED = 12  # the number of that
 NEVER = -(2**62)
+
+
+class ResetReason(IntEnum):
+    """Why the state jumped."""
+
+    NONE = 0
+    DATA_GAP = 1  # no data for longer than filter.restart_gap_s: it aligns anew
+    HEADING_LOST = 2  # without the inertial sensor for so long that the heading was lost: it aligns anew
+    NOT_FINITE = 3  # a number was no longer finite: it aligns anew
+    SOURCE_RETURNED = 4  # a source that was rejected all the time with the same error was taken as right
+    HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored one
+
+
+class Verdict(IntEnum):
+    """What became of a stored state at the start."""
+
+    NONE = 0  # there is none, or the filter has not started yet
+    BELIEVED = 1
+    DOUBTED = 2
+    OTHERWISE_KNOWN = 3
+    MOVED = 4
+    IN_MOTION = 5
+    VAGUE = 6
+    FUTURE = 7
+    STALE = 8
 
 
 class FilterState:
@@ -144,8 +170,12 @@ class FilterState:
         self.whole: Stamps = np.full(STAMPS_SIZE + sources * SOURCE_STAMPS_SIZE, NEVER, dtype=np.int64)
         self.stamps: Stamps = self.whole[:STAMPS_SIZE]
         self.source_stamps: Stamps = self.whole[STAMPS_SIZE:].reshape(sources, SOURCE_STAMPS_SIZE)
-        self.stamps[PHASE:] = 0
-        self.nominal[QUATERNION_EB.start] = 1.0
+        self.clear()
+
+    @property
+    def sources(self) -> int:
+        """Number of sources."""
+        return len(self.memory)
 
     def hypothesis(self, number: int) -> FilterState:
         """A view of one hypothesis as a state: nominal and covariance are its own, the rest is shared."""
@@ -166,6 +196,13 @@ class FilterState:
             self.bank[:] = 0.0
         self.core[:] = other.core
         self.whole[:] = other.whole
+
+    def clear(self) -> None:
+        """Become empty."""
+        self.numbers[:] = 0.0
+        self.nominal[QUATERNION_EB.start] = 1.0
+        self.whole[:] = NEVER
+        self.stamps[PHASE:] = 0
 
     def copy(self) -> FilterState:
         twin = FilterState(len(self.memory), self.size)

@@ -26,15 +26,18 @@ from fusiond.filter.state import (
     VELOCITY_E,
     FilterState,
 )
+from fusiond.maths.linear import mirror
 from fusiond.maths.portable import square
-from fusiond.maths.rotation import matrix, normalised, quaternion_exp, quaternion_multiply, skew
-from fusiond.maths.wgs84 import EARTH_RATE, GRAVITATIONAL_CONSTANT, Array, gravity_e
+from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, skew, times
+from fusiond.maths.typed import Covariance, Matrix3, Vector3, compiled
+from fusiond.maths.wgs84 import EARTH_RATE, MU, gravity_e
 
 COAST_ACCEL = 2.0  # m/s^2/sqrt(Hz): what a vehicle may do while the inertial sensor is silent
 COAST_TURN = 0.3  # rad/s/sqrt(Hz), about the vertical: a car in a bend, where the velocity turns along
 COAST_TILT = 0.03  # rad/s/sqrt(Hz), about any axis: a car's body on its springs, and a road's slope
 COAST_RATE = 0.5  # rad/s: the angular rate is not known any better then
-LONGEST_STEP = 0.05  # s: longer intervals are propagated in equal parts
+MAX_STEP = 0.05  # s: longer intervals are propagated in equal parts
+CORNER = slice(0, 9)  # position, velocity, attitude: the error states that the transition changes
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
 EARTH_RATE_SKEW = skew(EARTH_RATE_E)
 
@@ -49,97 +52,154 @@ class ProcessNoise(NamedTuple):
     calibrations: tuple[float, ...]  # of the error states from CALIBRATIONS on, per second
 
 
-def propagate(state: FilterState, dt: float, force_b: Array, rate_b: Array, noise: ProcessNoise) -> None:
+@compiled
+def propagate(state: FilterState, dt: float, force_b: Vector3, rate_b: Vector3, noise: ProcessNoise) -> None:
     """Carry the state `dt` [s] forward on the measured specific force (3,) and angular rate (3,), biases included, that
     hold at the middle of the interval."""
-    parts = max(1, math.ceil(dt / LONGEST_STEP))
-    for _ in range(parts):
+    parts = int(max(1.0, math.ceil(dt / MAX_STEP)))
+    for _part in range(parts):
         _step(state, dt / parts, force_b, rate_b, noise)
 
 
-def _step(state: FilterState, dt: float, force_b: Array, rate_b: Array, noise: ProcessNoise) -> None:
+@compiled
+def _step(state: FilterState, dt: float, force_b: Vector3, rate_b: Vector3, noise: ProcessNoise) -> None:
     x = state.nominal
     force = force_b - x[ACCEL_BIAS_B]
     turn = (rate_b - x[GYRO_BIAS_B]) * dt
-    earth_turn = EARTH_RATE_E * -dt
-    quaternion_eb = x[QUATERNION_EB]
-    half_turned = quaternion_multiply(quaternion_eb, quaternion_exp(turn / 2))
+    earth_turn = np.array([0.0, 0.0, EARTH_RATE * -dt])
+    velocity_e = x[VELOCITY_E].copy()
+    half_turned = quaternion_multiply(x[QUATERNION_EB], quaternion_exp(turn / 2))
     middle = quaternion_multiply(quaternion_exp(earth_turn / 2), half_turned)
     mat_eb = matrix(middle)
-    force_e = mat_eb @ force
-    velocity_e = x[VELOCITY_E].copy()
+    force_e = times(mat_eb, force)
     free = force_e + gravity_e(x[POSITION_E] + velocity_e * (dt / 2))
-    change = (free - 2 * EARTH_RATE_SKEW @ (velocity_e + free * (dt / 2))) * dt
+    half = velocity_e + free * (dt / 2)
+    change = np.array(  # less 2 omega_ie x v, with omega_ie along z
+        [
+            (free[0] + 2 * EARTH_RATE * half[1]) * dt,
+            (free[1] - 2 * EARTH_RATE * half[0]) * dt,
+            free[2] * dt,
+        ]
+    )
     gradient = gravity_gradient(x[POSITION_E])
     x[POSITION_E] += (velocity_e + change / 2) * dt
     x[VELOCITY_E] = velocity_e + change
-    turned = quaternion_multiply(quaternion_exp(earth_turn), quaternion_multiply(quaternion_eb, quaternion_exp(turn)))
+    turned = quaternion_multiply(quaternion_exp(earth_turn), quaternion_multiply(x[QUATERNION_EB], quaternion_exp(turn)))
     x[QUATERNION_EB] = normalised(turned)
+    _grow(state.covariance, dt, force_e, mat_eb, gradient)
+    _add_noise(state.covariance, dt, noise.accel, noise.gyro, noise)
 
-    _grow(state, _transition(state.size, dt, force_e, mat_eb, gradient), dt, noise.accel, noise.gyro, noise)
 
-
-def gravity_gradient(position_e: Array) -> Array:
+@compiled
+def gravity_gradient(position_e: Vector3) -> Matrix3:
     """Derivative (3, 3) [1/s^2] of gravity by position, spherical Earth (Groves 14.50, with the same sign for all axes)."""
-    r2 = float(position_e @ position_e)
-    strength = GRAVITATIONAL_CONSTANT / (r2 * math.sqrt(r2))
-    return strength * (3 * np.outer(position_e, position_e) / r2 - np.eye(3))
-
-
-def _transition(size: int, dt: float, force_e: Array, mat_eb: Array, gradient: Array) -> Array:
-    """Transition matrix (size, size) of the error state over `dt`: to the second order where position is reached through
-    velocity, and velocity through attitude."""
-    phi = np.eye(size)
-    force_skew = skew(force_e)
-    phi[POSITION, VELOCITY] = np.eye(3) * dt
-    phi[POSITION, ATTITUDE] = force_skew * (-dt * dt / 2)
-    phi[POSITION, ACCEL_BIAS] = mat_eb * (-dt * dt / 2)
-    phi[VELOCITY, POSITION] = gradient * dt
-    phi[VELOCITY, VELOCITY] -= EARTH_RATE_SKEW * (2 * dt)
-    phi[VELOCITY, ATTITUDE] = force_skew * -dt
-    phi[VELOCITY, GYRO_BIAS] = force_skew @ mat_eb * (dt * dt / 2)
-    phi[VELOCITY, ACCEL_BIAS] = mat_eb * -dt
-    phi[ATTITUDE, ATTITUDE] -= EARTH_RATE_SKEW * dt
-    phi[ATTITUDE, GYRO_BIAS] = mat_eb * -dt
-    return phi
-
-
-def _grow(state: FilterState, phi: Array, dt: float, accel: float, gyro: float, noise: ProcessNoise) -> None:
-    """P = Phi P Phi' + Q, with isotropic white noise on acceleration and rate, and random walks of the rest."""
-    covariance = phi @ state.covariance @ phi.T
-    covariance = (covariance + covariance.T) / 2
-    for block, density in (
-        (POSITION, accel * dt * dt / 3),
-        (VELOCITY, accel),
-        (ATTITUDE, gyro),
-        (ACCEL_BIAS, noise.accel_bias),
-        (GYRO_BIAS, noise.gyro_bias),
-    ):
-        for i in range(block.start, block.stop):
-            covariance[i, i] += density * dt
-    for i, density in enumerate(noise.calibrations, CALIBRATIONS):
-        covariance[i, i] += density * dt
+    r2 = position_e[0] * position_e[0] + position_e[1] * position_e[1] + position_e[2] * position_e[2]
+    strength = MU / (r2 * math.sqrt(r2))
+    gradient = np.empty((3, 3))
     for i in range(3):
-        covariance[POSITION.start + i, VELOCITY.start + i] += accel * dt * dt / 2
-        covariance[VELOCITY.start + i, POSITION.start + i] += accel * dt * dt / 2
-    state.covariance[:] = covariance
+        for j in range(3):
+            gradient[i, j] = strength * (3 * (position_e[i] * position_e[j]) / r2 - (1.0 if i == j else 0.0))
+    return gradient
 
 
-def coast(state: FilterState, dt: float, noise: ProcessNoise, *, rests: bool = False) -> None:
+@compiled
+def _grow(p: Covariance, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient: Matrix3) -> None:
+    """P = Phi P Phi' for the transition Phi over `dt`: to the second order where position is reached through velocity, and
+    velocity through attitude.
+
+    Only the rows and columns of position, velocity and attitude change. So Phi is applied to these rows, then to the columns
+    of the corner where they meet; both times the nine new numbers are those of the error model above.
+    """
+    c, f = mat_eb, force_e
+    half_dt2, earth_turn = dt * dt / 2, EARTH_RATE * dt
+    by_gyro, by_force = np.empty((3, len(p))), np.empty((3, len(p)))  # C b_g; C b_a + f_e x phi
+    rows = np.empty((9, len(p)))
+    for i in range(3):
+        by_gyro[i] = c[i, 0] * p[9] + c[i, 1] * p[10] + c[i, 2] * p[11]
+        by_force[i] = c[i, 0] * p[12] + c[i, 1] * p[13] + c[i, 2] * p[14]
+    by_force[0] += f[1] * p[8] - f[2] * p[7]
+    by_force[1] += f[2] * p[6] - f[0] * p[8]
+    by_force[2] += f[0] * p[7] - f[1] * p[6]
+    for i in range(3):
+        rows[i] = p[i] + dt * p[3 + i] - half_dt2 * by_force[i]
+        pulled = gradient[i]
+        rows[3 + i] = p[3 + i] - dt * by_force[i] + dt * (pulled[0] * p[0] + pulled[1] * p[1] + pulled[2] * p[2])
+        rows[6 + i] = p[6 + i] - dt * by_gyro[i]
+    rows[3] += half_dt2 * (f[1] * by_gyro[2] - f[2] * by_gyro[1]) + 2 * earth_turn * p[4]
+    rows[4] += half_dt2 * (f[2] * by_gyro[0] - f[0] * by_gyro[2]) - 2 * earth_turn * p[3]
+    rows[5] += half_dt2 * (f[0] * by_gyro[1] - f[1] * by_gyro[0])
+    rows[6] += earth_turn * p[7]
+    rows[7] -= earth_turn * p[6]
+
+    turned, felt = np.empty((3, 9)), np.empty((3, 9))  # the same two, of the columns
+    corner = np.empty((9, 9))
+    for i in range(3):
+        turned[i] = c[i, 0] * rows[:, 9] + c[i, 1] * rows[:, 10] + c[i, 2] * rows[:, 11]
+        felt[i] = c[i, 0] * rows[:, 12] + c[i, 1] * rows[:, 13] + c[i, 2] * rows[:, 14]
+    felt[0] += f[1] * rows[:, 8] - f[2] * rows[:, 7]
+    felt[1] += f[2] * rows[:, 6] - f[0] * rows[:, 8]
+    felt[2] += f[0] * rows[:, 7] - f[1] * rows[:, 6]
+    for i in range(3):
+        pulled = gradient[i]
+        corner[i] = rows[:, i] + dt * rows[:, 3 + i] - half_dt2 * felt[i]
+        corner[3 + i] = (
+            rows[:, 3 + i] - dt * felt[i] + dt * (pulled[0] * rows[:, 0] + pulled[1] * rows[:, 1] + pulled[2] * rows[:, 2])
+        )
+        corner[6 + i] = rows[:, 6 + i] - dt * turned[i]
+    corner[3] += half_dt2 * (f[1] * turned[2] - f[2] * turned[1]) + 2 * earth_turn * rows[:, 4]
+    corner[4] += half_dt2 * (f[2] * turned[0] - f[0] * turned[2]) - 2 * earth_turn * rows[:, 3]
+    corner[5] += half_dt2 * (f[0] * turned[1] - f[1] * turned[0])
+    corner[6] += earth_turn * rows[:, 7]
+    corner[7] -= earth_turn * rows[:, 6]
+
+    for i in range(9):
+        p[i, CORNER] = corner[:, i]
+        p[i, CORNER.stop :] = rows[i, CORNER.stop :]
+    mirror(p)
+
+
+@compiled
+def _add_noise(p: Covariance, dt: float, accel: float, gyro: float, noise: ProcessNoise) -> None:
+    """P += Q, with isotropic white noise on acceleration and rate, and random walks of the rest."""
+    cubic, quadratic = accel * dt * dt / 3 * dt, accel * dt * dt / 2
+    for i in range(3):
+        p[POSITION.start + i, POSITION.start + i] += cubic
+        p[VELOCITY.start + i, VELOCITY.start + i] += accel * dt
+        p[ATTITUDE.start + i, ATTITUDE.start + i] += gyro * dt
+        p[ACCEL_BIAS.start + i, ACCEL_BIAS.start + i] += noise.accel_bias * dt
+        p[GYRO_BIAS.start + i, GYRO_BIAS.start + i] += noise.gyro_bias * dt
+        p[POSITION.start + i, VELOCITY.start + i] += quadratic
+        p[VELOCITY.start + i, POSITION.start + i] += quadratic
+    for i in range(CALIBRATIONS, len(p)):
+        p[i, i] += noise.calibrations[i - CALIBRATIONS] * dt
+
+
+@compiled
+def coast(state: FilterState, dt: float, noise: ProcessNoise, rests: bool = False) -> None:
     """Carry the state `dt` [s] forward without inertial samples: constant velocity and attitude over the ground, with the
     uncertainty of a vehicle that may do otherwise; one that rests neither speeds up nor turns. When it turns, its velocity
     turns along: wheels and body stay in line, whatever the heading."""
-    x = state.nominal
+    x, p = state.nominal, state.covariance
     x[POSITION_E] += x[VELOCITY_E] * dt
-    phi = np.eye(state.size)
-    phi[POSITION, VELOCITY] = np.eye(3) * dt
-    _grow(state, phi, dt, 0.0 if rests else square(COAST_ACCEL), square(COAST_TILT), noise)
+    for i in range(3):
+        p[i] += dt * p[VELOCITY.start + i]
+    for i in range(3):
+        p[:, i] += dt * p[:, VELOCITY.start + i]
+    mirror(p)
+    _add_noise(p, dt, 0.0 if rests else square(COAST_ACCEL), square(COAST_TILT), noise)
     if rests:
         return
-    up_e = x[POSITION_E] / math.sqrt(float(x[POSITION_E] @ x[POSITION_E]))
-    sideways_e = np.cross(up_e, x[VELOCITY_E])
-    turned = np.zeros((2, state.size))  # what a turn changes at once, and what it does from then on
-    turned[0, ATTITUDE], turned[0, VELOCITY], turned[1, POSITION] = up_e, sideways_e, sideways_e
-    grown = np.outer(turned[0], turned[0]) * dt + np.outer(turned[1], turned[1]) * (dt * dt * dt / 3)
-    across = np.outer(turned[0], turned[1]) * (dt * dt / 2)
-    state.covariance += square(COAST_TURN) * (grown + across + across.T)
+    r = x[POSITION_E]
+    up_e = r / math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+    sideways_e = cross(up_e, x[VELOCITY_E])
+    turned, displaced = np.zeros(len(p)), np.zeros(len(p))  # what a turn changes at once, and what it does from then on
+    turned[ATTITUDE], turned[VELOCITY], displaced[POSITION] = up_e, sideways_e, sideways_e
+    first, second = square(COAST_TURN) * dt, square(COAST_TURN) * (dt * dt / 2)
+    third = square(COAST_TURN) * (dt * dt * dt / 3)
+    for i in range(len(p)):
+        p[i] += (
+            first * turned[i] * turned
+            + third * displaced[i] * displaced
+            + second * (turned[i] * displaced + displaced[i] * turned)
+        )
+    mirror(p)

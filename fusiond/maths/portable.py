@@ -2,12 +2,14 @@
 
 The C library picks its variants by the processor (with or without fused multiply-add), so its last bit is not the same
 everywhere. These are: the same operations in the same order give the same bits on every machine, here and in the
-compiled kernel, which holds the same functions. Method and coefficients: fdlibm (Sun Microsystems, 1993).
+compiled kernel, whose source is made from these. Method and coefficients: fdlibm (Sun Microsystems, 1993).
 """
 
 from __future__ import annotations
 
 import math
+
+from fusiond.maths.typed import compiled
 
 HALF_PI_HIGH, HALF_PI_LOW = 1.57079632673412561417, 6.07710050650619224932e-11
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
@@ -37,11 +39,13 @@ ATAN = (
 )
 
 
+@compiled
 def square(x: float) -> float:
     """x * x, which is rounded once; x**2 is the C library's power."""
     return x * x
 
 
+@compiled
 def sin_cos(x: float) -> tuple[float, float]:
     """Sine and cosine of an angle [rad] of moderate size (below 1e5); nan where it is not finite."""
     if not math.isfinite(x):
@@ -82,6 +86,7 @@ def sin_cos(x: float) -> tuple[float, float]:
     return -cosine, sine
 
 
+@compiled
 def _atan(x: float) -> float:
     """Arc tangent of x >= 0."""
     if x < 0.4375:
@@ -101,6 +106,7 @@ def _atan(x: float) -> float:
     return high - ((u * (odd + even) - low) - u)
 
 
+@compiled
 def atan2(y: float, x: float) -> float:
     """Angle [rad] in (-pi, pi] of the point (x, y); 0 for the origin."""
     if x == 0.0 and y == 0.0:
@@ -117,6 +123,7 @@ def asin(x: float) -> float:
     return atan2(x, math.sqrt(max(0.0, (1.0 - x) * (1.0 + x))))
 
 
+@compiled
 def exp(x: float) -> float:
     """Exponential; 0 below -700, infinite above 700, nan of nan."""
     if math.isnan(x):
@@ -142,8 +149,7 @@ def exp(x: float) -> float:
 
 
 def log(x: float) -> float:
-    """Natural logarithm; minus infinity of 0, infinite of infinity, nan below 0 and of nan. Only here: no model that the
-    compiled kernel knows needs it."""
+    """Natural logarithm; minus infinity of 0, infinite of infinity, nan below 0 and of nan."""
     if not 0.0 < x < math.inf:
         return -math.inf if x == 0.0 else x if x > 0.0 else math.nan
     fraction, k = math.frexp(x)

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from fusiond.maths.portable import asin, atan2, sin_cos
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array, Matrix3, Quaternion, Vector3, compiled
 
 
 def product(left: Array, right: Array) -> Array:
@@ -21,13 +21,53 @@ def product(left: Array, right: Array) -> Array:
     return summed
 
 
+@compiled
+def times(mat: Matrix3, v: Vector3) -> Vector3:
+    """mat @ v (3,)."""
+    return np.array(
+        [
+            mat[0, 0] * v[0] + mat[0, 1] * v[1] + mat[0, 2] * v[2],
+            mat[1, 0] * v[0] + mat[1, 1] * v[1] + mat[1, 2] * v[2],
+            mat[2, 0] * v[0] + mat[2, 1] * v[1] + mat[2, 2] * v[2],
+        ]
+    )
+
+
+@compiled
+def transposed_times(mat: Matrix3, v: Vector3) -> Vector3:
+    """mat.T @ v (3,)."""
+    return np.array(
+        [
+            mat[0, 0] * v[0] + mat[1, 0] * v[1] + mat[2, 0] * v[2],
+            mat[0, 1] * v[0] + mat[1, 1] * v[1] + mat[2, 1] * v[2],
+            mat[0, 2] * v[0] + mat[1, 2] * v[1] + mat[2, 2] * v[2],
+        ]
+    )
+
+
+@compiled
+def matrix_product(a: Matrix3, b: Matrix3) -> Matrix3:
+    """a @ b (3, 3)."""
+    found = np.empty((3, 3))
+    for i in range(3):
+        found[i] = a[i, 0] * b[0] + a[i, 1] * b[1] + a[i, 2] * b[2]
+    return found
+
+
+@compiled
+def cross(a: Vector3, b: Vector3) -> Vector3:
+    """a x b (3,)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
 def skew(v: Array) -> Array:
     """The matrix (3, 3) with skew(v) @ u = v x u."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def quaternion_exp(rotation: Array) -> Array:
+@compiled
+def quaternion_exp(rotation: Vector3) -> Quaternion:
     """Quaternion (4,) of a rotation vector (3,) [rad]."""
     x, y, z = rotation
     angle2 = x * x + y * y + z * z
@@ -40,7 +80,8 @@ def quaternion_exp(rotation: Array) -> Array:
     return np.array([w, scale * x, scale * y, scale * z])
 
 
-def quaternion_multiply(a: Array, b: Array) -> Array:
+@compiled
+def quaternion_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product (4,): the rotation b first, then a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
@@ -54,12 +95,15 @@ def quaternion_multiply(a: Array, b: Array) -> Array:
     )
 
 
-def normalised(quaternion: Array) -> Array:
+@compiled
+def normalised(quaternion: Quaternion) -> Quaternion:
+    """The quaternion (4,) of length 1 in the same direction."""
     w, x, y, z = quaternion
     return quaternion / math.sqrt(w * w + x * x + y * y + z * z)
 
 
-def matrix(quaternion_ab: Array) -> Array:
+@compiled
+def matrix(quaternion_ab: Quaternion) -> Matrix3:
     """Rotation matrix (3, 3) of a unit quaternion (4,)."""
     w, x, y, z = quaternion_ab
     return np.array(
@@ -71,20 +115,28 @@ def matrix(quaternion_ab: Array) -> Array:
     )
 
 
-def quaternion(mat_ab: Array) -> Array:
+@compiled
+def quaternion(mat_ab: Matrix3) -> Quaternion:
     """Unit quaternion (4,), w >= 0, of a rotation matrix (3, 3) (Shepperd's method)."""
     m = mat_ab
+    q = np.empty(4)
     trace = m[0, 0] + m[1, 1] + m[2, 2]
-    pick = int(np.argmax([trace, m[0, 0], m[1, 1], m[2, 2]]))
+    largest, pick = trace, 0
+    for i in range(3):
+        if m[i, i] > largest:
+            largest, pick = m[i, i], i + 1
     if pick == 0:
-        q = np.array([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+        q[0], q[1], q[2], q[3] = 1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     elif pick == 1:
-        q = np.array([m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]])
+        q[0], q[1], q[2], q[3] = m[2, 1] - m[1, 2], 1 + 2 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]
     elif pick == 2:
-        q = np.array([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 + 2 * m[1, 1] - trace, m[1, 2] + m[2, 1]])
+        q[0], q[1], q[2], q[3] = m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 + 2 * m[1, 1] - trace, m[1, 2] + m[2, 1]
     else:
-        q = np.array([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 + 2 * m[2, 2] - trace])
-    return normalised(q if q[0] >= 0 else -q)
+        q[0], q[1], q[2], q[3] = m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 + 2 * m[2, 2] - trace
+    if not q[0] >= 0:
+        for i in range(4):
+            q[i] = -q[i]
+    return normalised(q)
 
 
 def matrix_from_euler(roll: float, pitch: float, yaw: float) -> Array:

@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.maths.portable import atan2, sin_cos, square
-
-Array = NDArray[np.float64]
+from fusiond.maths.typed import Array, Matrix3, Vector3, compiled
 
 SEMI_MAJOR = 6378137.0  # m
 FLATTENING = 1 / 298.257223563
@@ -21,10 +19,10 @@ SEMI_MINOR = SEMI_MAJOR * (1 - FLATTENING)  # m
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 SECOND_ECCENTRICITY2 = ECCENTRICITY2 / (1 - ECCENTRICITY2)
 EARTH_RATE = 7.292115e-5  # rad/s
-GRAVITATIONAL_CONSTANT = 3.986004418e14  # m^3/s^2
+MU = 3.986004418e14  # m^3/s^2, geocentric gravitational constant
 EQUATOR_GRAVITY = 9.7803253359  # m/s^2
 SOMIGLIANA = 0.00193185265241
-GRAVITY_RATIO = square(EARTH_RATE) * square(SEMI_MAJOR) * SEMI_MINOR / GRAVITATIONAL_CONSTANT
+GRAVITY_RATIO = square(EARTH_RATE) * square(SEMI_MAJOR) * SEMI_MINOR / MU
 
 
 def radii(latitude: float) -> tuple[float, float]:
@@ -42,6 +40,7 @@ def ecef(latitude: float, longitude: float, height: float) -> Array:
     return np.array([around * cos_lon, around * sin_lon, (transverse * (1 - ECCENTRICITY2) + height) * sin_lat])
 
 
+@compiled
 def geodetic_trig(x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Sine and cosine of latitude, then of longitude, of an earth-fixed position [m].
 
@@ -49,7 +48,10 @@ def geodetic_trig(x: float, y: float, z: float) -> tuple[float, float, float, fl
     longitude is taken as 0.
     """
     p = math.sqrt(x * x + y * y)
-    sin_lon, cos_lon = (y / p, x / p) if p > 0 else (0.0, 1.0)
+    if p > 0:
+        sin_lon, cos_lon = y / p, x / p
+    else:
+        sin_lon, cos_lon = 0.0, 1.0
     tangent_n, tangent_d = z * SEMI_MAJOR, p * SEMI_MINOR  # of the reduced latitude
     sin_lat, cos_lat = 0.0, 1.0
     for _ in range(2):
@@ -63,20 +65,23 @@ def geodetic_trig(x: float, y: float, z: float) -> tuple[float, float, float, fl
     return sin_lat, cos_lat, sin_lon, cos_lon
 
 
+@compiled
 def height_of(x: float, y: float, z: float, sin_lat: float, cos_lat: float) -> float:
     """Height above the ellipsoid [m] of an earth-fixed position [m] whose geodetic latitude is known."""
     root = math.sqrt(1 - ECCENTRICITY2 * sin_lat * sin_lat)
     return math.sqrt(x * x + y * y) * cos_lat + z * sin_lat - SEMI_MAJOR * root
 
 
-def geodetic(position_e: Array) -> tuple[float, float, float]:
+@compiled
+def geodetic(position_e: Vector3) -> tuple[float, float, float]:
     """Latitude, longitude [rad], height [m] of an earth-fixed position (3,) [m]."""
-    x, y, z = (float(c) for c in position_e)
+    x, y, z = float(position_e[0]), float(position_e[1]), float(position_e[2])
     sin_lat, cos_lat, sin_lon, cos_lon = geodetic_trig(x, y, z)
     return atan2(sin_lat, cos_lat), atan2(sin_lon, cos_lon), height_of(x, y, z, sin_lat, cos_lat)
 
 
-def mat_ne_from_trig(sin_lat: float, cos_lat: float, sin_lon: float, cos_lon: float) -> Array:
+@compiled
+def mat_ne_from_trig(sin_lat: float, cos_lat: float, sin_lon: float, cos_lon: float) -> Matrix3:
     """Rotation (3, 3) from earth-fixed to north-east-down axes."""
     return np.array(
         [
@@ -87,12 +92,14 @@ def mat_ne_from_trig(sin_lat: float, cos_lat: float, sin_lon: float, cos_lon: fl
     )
 
 
-def mat_ne(position_e: Array) -> Array:
+@compiled
+def mat_ne(position_e: Vector3) -> Matrix3:
     """Rotation (3, 3) from earth-fixed to north-east-down axes at an earth-fixed position (3,) [m]."""
-    x, y, z = (float(c) for c in position_e)
-    return mat_ne_from_trig(*geodetic_trig(x, y, z))
+    sin_lat, cos_lat, sin_lon, cos_lon = geodetic_trig(position_e[0], position_e[1], position_e[2])
+    return mat_ne_from_trig(sin_lat, cos_lat, sin_lon, cos_lon)
 
 
+@compiled
 def normal_gravity(sin_lat: float, height: float) -> float:
     """Gravity [m/s^2], centrifugal part included, from the sine of latitude and the height [m]: Somigliana's formula
     and its second-order continuation upward (TR8350.2, 4-1 and 4-3)."""
@@ -107,9 +114,10 @@ def gravity(latitude: float, height: float) -> float:
     return normal_gravity(sin_cos(latitude)[0], height)
 
 
-def gravity_e(position_e: Array) -> Array:
+@compiled
+def gravity_e(position_e: Vector3) -> Vector3:
     """Normal gravity vector (3,) [m/s^2] in earth-fixed axes at an earth-fixed position (3,) [m]."""
-    x, y, z = (float(c) for c in position_e)
+    x, y, z = float(position_e[0]), float(position_e[1]), float(position_e[2])
     sin_lat, cos_lat, sin_lon, cos_lon = geodetic_trig(x, y, z)
     g = normal_gravity(sin_lat, height_of(x, y, z, sin_lat, cos_lat))
     return np.array([-g * cos_lat * cos_lon, -g * cos_lat * sin_lon, -g * sin_lat])

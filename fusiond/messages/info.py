@@ -9,9 +9,8 @@ import msgspec
 from fusiond import __version__
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
-from fusiond.filter.observations import MODELS
-from fusiond.filter.parameters import IMU
-from fusiond.filter.step import Kernel
+from fusiond.filter.kernel.interpreted import Kernel
+from fusiond.filter.observations import IMU, MODELS
 from fusiond.messages.keys import key
 from fusiond.messages.types import MESSAGES, SCHEMA_VERSION, ConfigMessage, InfoMessage
 

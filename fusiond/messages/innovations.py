@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import ImuSample
-from fusiond.filter.step import Outcome
+from fusiond.filter.rows import Outcome
 from fusiond.messages.types import InnovationMessage, OutcomeName
 
 NAMES: dict[Outcome, OutcomeName] = {

@@ -21,9 +21,8 @@ from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.estimator.solution import Mode
 from fusiond.events import Received
 from fusiond.filter.calibration import calibrations
-from fusiond.filter.hot_start import decided
 from fusiond.filter.source_health import STATUSES
-from fusiond.filter.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
+from fusiond.filter.state import LAST_RATIO, NEVER, RESET_REASON, RESET_SOURCE, T_FUSED, T_REJECTED, ResetReason
 from fusiond.messages.innovations import Innovations
 from fusiond.messages.types import (
     Calibration,
@@ -183,9 +182,7 @@ class Changes:
         self.reset_reason: str | None = None
         self._config, self._fusion = config, fusion
         self._mode: Mode | None = None
-        self._resets = self._blown = 0
-        self._decided = False
-        self._started: int = NEVER
+        self._resets = 0
         self._present: frozenset[str] = frozenset()
         self._statuses = dict.fromkeys(fusion.plan.sources, "nominal")
         self._look_ns: int = NEVER
@@ -196,14 +193,11 @@ class Changes:
         def event(**fields: Any) -> EventMessage:
             return EventMessage(vehicle=state.vehicle, t_ns=state.t_ns, **fields)
 
-        stamps = self._fusion.history.head.stamps
         if state.resets != self._resets:
             if state.resets > self._resets:
                 self.reset_reason = self._why()
                 yield event(kind="reset", severity="warning", subject="", text=f"state reset: {self.reset_reason}")
             self._resets = state.resets
-        self._blown, self._started = int(stamps[BLOWN]), int(stamps[T_START])
-        self._decided = decided(self._fusion.history.head, self._fusion.plan)
         if state.mode is not self._mode:
             text = state.mode.value if self._mode is None else f"{self._mode.value} -> {state.mode.value}"
             yield event(kind="mode", severity=SEVERITY[state.mode], subject=state.mode.value, text=f"mode: {text}")
@@ -224,19 +218,18 @@ class Changes:
                     yield event(kind="source_status", severity="info" if good else "warning", subject=source, text=text)
 
     def _why(self) -> str:
-        """Why the state was reset, as far as it can be seen from the state now."""
-        fusion, settings = self._fusion, self._config.filter
-        head = fusion.history.head
-        if decided(head, fusion.plan) and not self._decided:
-            return "the drive has decided on the heading, which was a stored one"
-        if head.stamps[BLOWN] > self._blown:
-            return "it was no longer finite; aligning anew"
-        if head.stamps[T_START] != self._started:
-            gap = f"more than {settings.restart_gap_s:g} s without data, or without the IMU until the heading was lost"
-            return f"{gap}; aligning anew"
-        believed = [name for i, name in enumerate(fusion.plan.sources) if head.memory[i, LAST_RATIO] > 1
-                    and head.source_stamps[i, T_REJECTED] == NEVER]  # fmt: skip
-        return f"{' and '.join(believed) or 'GNSS'} was rejected, off alike all the time, and is now believed again"
+        """Why the state was reset, in words."""
+        stamps = self._fusion.history.head.stamps
+        source = self._fusion.plan.sources[int(stamps[RESET_SOURCE])]
+        gap = f"more than {self._config.filter.restart_gap_s:g} s without data; aligning anew"
+        return {
+            ResetReason.NONE: "",
+            ResetReason.DATA_GAP: gap,
+            ResetReason.HEADING_LOST: "the heading was lost without the IMU; aligning anew",
+            ResetReason.NOT_FINITE: "a number was no longer finite; aligning anew",
+            ResetReason.SOURCE_RETURNED: f"{source} was rejected for long with the same error, and is now taken as right",
+            ResetReason.HEADING_DECIDED: "the drive has decided on the heading, which was a stored one",
+        }[ResetReason(int(stamps[RESET_REASON]))]
 
 
 def nis_means(fusion: Fusion) -> dict[str, float]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.filter.observations.barometric_height import GAS_CONSTANT, LAYERS, NOMINAL_RADIUS, STANDARD_GRAVITY
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Barometer
 
 CENTI_CELSIUS = 3200  # of the sensor in its warm box

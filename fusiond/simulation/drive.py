@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fusiond.events import Received
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation import barometer, gnss, imu, wheels
 from fusiond.simulation.chatter import FIRST_ID, TELEMETRY_HZ, traffic_rates
 from fusiond.simulation.gnss import Fixes

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Gnss, Scenario
 from fusiond.simulation.trajectory import Trajectory, turned
 from fusiond.simulation.transport import Mask, within

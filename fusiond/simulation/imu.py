@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusiond.events import Vector3
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Imu
 from fusiond.simulation.truth import Motion
 

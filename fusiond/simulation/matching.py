@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation import wheels
 from fusiond.simulation.scenario import WHEELS, Barometer, Gnss, Imu, Scenario
 from fusiond.simulation.trajectory import euler_matrix

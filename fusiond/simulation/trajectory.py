@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusiond.events import Vector3
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Scenario
 from fusiond.simulation.wgs84 import radii, wrapped
 

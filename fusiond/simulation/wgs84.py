@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.maths.wgs84 import EARTH_RATE, EQUATOR_GRAVITY, FLATTENING, GRAVITY_RATIO, SEMI_MAJOR, SOMIGLIANA, Array
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import EARTH_RATE, EQUATOR_GRAVITY, FLATTENING, GRAVITY_RATIO, SEMI_MAJOR, SOMIGLIANA
 
 E2 = FLATTENING * (2 - FLATTENING)
 

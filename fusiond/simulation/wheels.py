@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import RAW_MAX_SIGNED, RAW_MAX_UNSIGNED, WHEELS, Scenario, Wheels
 from fusiond.simulation.trajectory import Kinematics
 from fusiond.simulation.transport import Mask, within

@@ -16,7 +16,7 @@ import pytest
 from fusiond.app.demo.demo import DRIVE, LOGS
 from fusiond.app.replay.replay import Options, replay
 from fusiond.config import load as config
-from fusiond.filter.step import compiled_available
+from fusiond.filter.kernel.interpreted import compiled_available
 
 GOLDEN = Path(__file__).parent / "demo.csv"
 

@@ -13,10 +13,11 @@ import numpy as np
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
+from fusiond.filter.rows import ROW, Outcome
 from fusiond.filter.state import ERROR_SIZE, PHASE, POSITION_E, QUATERNION_EB, RUNNING, VELOCITY_E, FilterState, T
-from fusiond.filter.step import ROW, Outcome
 from fusiond.maths.rotation import matrix_from_euler, quaternion
-from fusiond.maths.wgs84 import EARTH_RATE, Array, ecef, geodetic, gravity_e, mat_ne, radii
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import EARTH_RATE, ecef, geodetic, gravity_e, mat_ne, radii
 
 MS = 1_000_000  # ns
 SECOND = 1_000 * MS

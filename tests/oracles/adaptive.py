@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 
 def weights(variances: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 
 def posterior(prior: Array, likelihoods: Array) -> Array:

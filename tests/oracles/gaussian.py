@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 
 class Gaussian(NamedTuple):

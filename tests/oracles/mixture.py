@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from tests.oracles.gaussian import Gaussian
 
 Loss = Literal["squared", "absolute", "zero-one"]

@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 
 from fusiond.config.schema import Config
-from fusiond.filter.parameters import IMU, MODEL, plan
+from fusiond.filter.kernel.interpreted import compiled_available, make_kernel
+from fusiond.filter.observations import IMU, MODEL
+from fusiond.filter.parameters import plan
+from fusiond.filter.rows import ROW
 from fusiond.filter.state import BLOWN, POSITION_E, RESETS, VELOCITY_E, FilterState
-from fusiond.filter.step import ROW, compiled_available, make_kernel, run_one
+from fusiond.filter.step import run_one
 from fusiond.maths.wgs84 import ecef, mat_ne
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import parse

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
-from fusiond.filter.step import Outcome
+from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages.latency import RecentLatencies
 from fusiond.messages.schedule import Publication, Surroundings

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from msgspec import Struct
 
 from fusiond.errors import UnusableError
-from fusiond.filter.measurement_update import chi_square
+from fusiond.maths.statistics import chi_square
 from fusiond.maths.wgs84 import radii
 from fusiond.messages.types import State, StateMessage
 

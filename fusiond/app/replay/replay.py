@@ -30,8 +30,9 @@ from fusiond.engine import SECOND, Engine
 from fusiond.errors import UnusableError, UsageError
 from fusiond.estimator.fusion import Receipt
 from fusiond.events import ClockPair, Received
-from fusiond.filter.hot_start import WORDS, Verdict
-from fusiond.filter.step import Outcome
+from fusiond.filter.hot_start import WORDS
+from fusiond.filter.rows import Outcome
+from fusiond.filter.state import Verdict
 from fusiond.filter.stored_state import StoredState, StoredStateError, check
 from fusiond.messages.schedule import Publication
 from fusiond.messages.types import Message, StateMessage, csv_header, csv_row

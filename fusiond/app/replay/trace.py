@@ -9,7 +9,7 @@ from fusiond.app.replay.comparison import Errors, displacement
 from fusiond.estimator.fusion import Receipt
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssPosition
-from fusiond.filter.step import Outcome
+from fusiond.filter.rows import Outcome
 from fusiond.messages.types import StateMessage
 
 CAPACITY = 6000  # samples kept of each kind: more than a picture has pixels across

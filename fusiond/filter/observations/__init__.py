@@ -1,4 +1,4 @@
-"""The table of observation models: one file each, one line each. The kernel knows them by their place in `MODELS`."""
+"""The table of observation models: one file each, one line each. A source's model is known by its place in `MODELS`."""
 
 from __future__ import annotations
 
@@ -16,34 +16,26 @@ from fusiond.filter.observations import (
 )
 from fusiond.filter.observations.model import Observation
 from fusiond.filter.state import FilterState
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array, Vector, compiled
 
 
 class Model(NamedTuple):
     """One kind of measurement. A source of it is called by the name of its table in the configuration, [table.NAME], with
     the suffix. `values` makes a row of numbers of a payload and that table, `parameters` another of the table alone, and
-    `observe` takes both. Without a table it is a constraint, which the filter applies by itself."""
+    `observe` takes both and fills an Observation."""
 
     name: str
-    table: str | None
+    table: str
     suffix: str
     parameters: Callable[[Any], Array]
     values: Callable[[Any, Any], tuple[float, ...]]
-    observe: Callable[[FilterState, Array, Array], Observation | None]
-
-
-def no_values(payload: Any, section: Any) -> tuple[float, ...]:
-    """Of a constraint, which has no payload."""
-    return ()
+    observe: Callable[[FilterState, Array, Array, Observation], bool]
 
 
 MODELS = (
     Model("gnss_position", "gnss", ".position", gnss_position.parameters, gnss_position.values, gnss_position.observe),
     Model("gnss_velocity", "gnss", ".velocity", gnss_velocity.parameters, gnss_velocity.values, gnss_velocity.observe),
     Model("wheel_speed", "wheel", "", wheel_speed.parameters, wheel_speed.values, wheel_speed.observe),
-    Model("non_holonomic", None, "", non_holonomic.parameters, no_values, non_holonomic.observe),
-    Model("zero_velocity", None, "", zero_velocity.parameters, no_values, zero_velocity.observe),
-    Model("zero_rotation", None, "", zero_rotation.parameters, no_values, zero_rotation.observe),
     Model(
         "barometric_height",
         "barometer",
@@ -53,4 +45,13 @@ MODELS = (
         barometric_height.observe,
     ),
 )
-CONSTRAINTS = tuple(model for model in MODELS if model.table is None)
+IMU = -1  # stands for the inertial sensor where others have their place in MODELS
+MODEL = {model.name: number for number, model in enumerate(MODELS)}
+GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED = MODEL["gnss_position"], MODEL["gnss_velocity"], MODEL["wheel_speed"]
+CONSTRAINTS = (non_holonomic, zero_velocity, zero_rotation)  # what the filter observes by itself: rows of Plan.constraints
+
+
+@compiled
+def observe(state: FilterState, model: int, row: Vector, parameter: Vector, seen: Observation) -> bool:
+    """Observe a source's reading by its model."""
+    return MODELS[model].observe(state, row, parameter, seen)

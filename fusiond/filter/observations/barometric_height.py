@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from fusiond.config.schema import Barometer
 from fusiond.events import Pressure
-from fusiond.filter.observations.model import CORRELATION, PARAMETERS, Observation, Unusable
+from fusiond.filter.observations.model import CORRELATION, RESETS, Observation, Unusable, begin, empty_row
 from fusiond.filter.state import HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR, POSITION, POSITION_E, FilterState
 from fusiond.maths.portable import exp, log, square
-from fusiond.maths.wgs84 import Array, geodetic, mat_ne
+from fusiond.maths.typed import Array, Vector, compiled
+from fusiond.maths.wgs84 import geodetic, mat_ne
 
 ALTITUDE, VARIANCE = 0, 1  # m, m^2: values
 
@@ -28,8 +27,9 @@ LAYERS = (  # base: pressure [Pa], geopotential height [m], temperature [K], and
 
 
 def parameters(barometer: Barometer) -> Array:
-    row = np.zeros(PARAMETERS)
+    row = empty_row()
     row[CORRELATION] = barometer.correlation_s
+    row[RESETS] = HEIGHT_OFFSET_ERROR.start
     return row
 
 
@@ -50,11 +50,15 @@ def pressure_altitude(pressure: float) -> float:
     return height + temperature / gradient * (exp(gradient * depth) - 1)
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+@compiled
+def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
     """Innovation (1,) [m], up: pressure altitude less height and offset. The height is that of the IMU."""
     x = state.nominal
-    jacobian = np.zeros((1, state.size))
-    jacobian[0, POSITION] = -mat_ne(x[POSITION_E])[2]  # up is minus down
-    jacobian[0, HEIGHT_OFFSET_ERROR] = 1.0
-    innovation = row[ALTITUDE] - geodetic(x[POSITION_E])[2] - x[HEIGHT_OFFSET.start]
-    return Observation(np.array([innovation]), jacobian, np.array([row[VARIANCE]]))
+    to_n = mat_ne(x[POSITION_E])
+    begin(seen, 1)
+    seen.jacobian[0, POSITION] = -to_n[2]  # up is minus down
+    seen.jacobian[0, HEIGHT_OFFSET_ERROR.start] = 1.0
+    _, _, height = geodetic(x[POSITION_E])
+    seen.innovation[0] = row[ALTITUDE] - height - x[HEIGHT_OFFSET.start]
+    seen.variance[0] = row[VARIANCE]
+    return True

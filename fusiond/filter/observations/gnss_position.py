@@ -12,12 +12,15 @@ from fusiond.filter.observations.model import (
     CALIBRATED,
     CORRELATION,
     LEVER_ARM_B,
-    PARAMETERS,
+    RESETS,
     Observation,
     Unusable,
+    begin,
+    empty_row,
     mat_eb,
     mean_rate_b,
     rate_b,
+    skew_rows,
     within,
 )
 from fusiond.filter.state import (
@@ -34,8 +37,9 @@ from fusiond.filter.state import (
     FilterState,
 )
 from fusiond.maths.portable import square
-from fusiond.maths.rotation import skew
-from fusiond.maths.wgs84 import Array, ecef, mat_ne
+from fusiond.maths.rotation import cross, matrix_product, times
+from fusiond.maths.typed import Array, Matrix3, Vector, Vector3, compiled
+from fusiond.maths.wgs84 import ecef, mat_ne
 
 PLACE_E = slice(0, 3)  # m, values
 VARIANCE_HORIZONTAL, VARIANCE_VERTICAL = 3, 4  # m^2, values
@@ -44,10 +48,11 @@ HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
 
 
 def parameters(gnss: Gnss) -> Array:
-    row = np.zeros(PARAMETERS)
+    row = empty_row()
     row[LEVER_ARM_B] = gnss.lever_arm_m
     row[CORRELATION] = gnss.position_correlation_s
     row[CALIBRATED] = float(calibrated(gnss))
+    row[RESETS] = POSITION.start
     return row
 
 
@@ -64,32 +69,45 @@ def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
     return x, y, z, square(horizontal), square(vertical)
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+@compiled
+def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
     """Innovation (3,) [m], north-east-down. A delay that is a state takes the antenna back along its velocity."""
-    to_n = mat_ne(state.nominal[POSITION_E])
-    lever_e = mat_eb(state) @ parameter[LEVER_ARM_B]
-    jacobian = np.zeros((3, state.size))
-    jacobian[:, POSITION] = to_n
-    if parameter[CALIBRATED]:
-        lever_e = _calibrated(state, parameter[LEVER_ARM_B], to_n, jacobian)
-    jacobian[:, ATTITUDE] = -to_n @ skew(lever_e)
-    horizontal, vertical = row[VARIANCE_HORIZONTAL], row[VARIANCE_VERTICAL]
-    innovation = to_n @ (row[PLACE_E] - state.nominal[POSITION_E] - lever_e)
-    if parameter[CALIBRATED]:
-        innovation += to_n @ state.nominal[VELOCITY_E] * state.nominal[DELAYS.start]
-    return Observation(innovation, jacobian, np.array([horizontal, horizontal, vertical]))
+    x = state.nominal
+    to_n = mat_ne(x[POSITION_E])
+    begin(seen, 3)
+    delay = 0.0
+    lever_e = np.empty(3)
+    if parameter[CALIBRATED] != 0.0:
+        delay = x[DELAYS.start]
+        lever_e[:] = _calibrated(state, parameter[LEVER_ARM_B], to_n, seen)
+    else:
+        lever_e[:] = times(mat_eb(state), parameter[LEVER_ARM_B])
+    for i in range(3):
+        seen.jacobian[i, POSITION] = to_n[i]
+    skew_rows(to_n, lever_e, -1.0, 3, seen.jacobian, ATTITUDE.start)
+    off_e = row[PLACE_E] - x[POSITION_E] - lever_e + x[VELOCITY_E] * delay
+    seen.innovation[:] = times(to_n, off_e)
+    seen.variance[0] = seen.variance[1] = row[VARIANCE_HORIZONTAL]
+    seen.variance[2] = row[VARIANCE_VERTICAL]
+    return True
 
 
-def _calibrated(state: FilterState, lever_b: Array, to_n: Array, jacobian: Array) -> Array:
+@compiled
+def _calibrated(state: FilterState, lever_b: Vector3, to_n: Matrix3, seen: Observation) -> Vector3:
     """The antenna from the IMU (3,) [m, e axes] where lever arm and delay are states, but for the way that the IMU itself
     goes in the delay; fills the jacobian's columns of lever arm, delay, velocity and gyro bias."""
     x = state.nominal
-    rotation, rate, delay = mat_eb(state), rate_b(state), float(x[DELAYS.start])
-    lever_b = lever_b + x[ANTENNA_B]
-    swing_b = np.cross(rate, lever_b)
-    turned = to_n @ rotation
-    jacobian[:, VELOCITY] = to_n * -delay
-    jacobian[:, GYRO_BIAS] = turned @ skew(lever_b) * -delay
-    jacobian[:, ANTENNA_ERROR] = turned - turned @ skew(mean_rate_b(state)) * delay
-    jacobian[:, DELAYS_ERROR.start] = -(to_n @ x[VELOCITY_E] + turned @ swing_b)
-    return rotation @ (lever_b - swing_b * delay)
+    rotation, delay = mat_eb(state), x[DELAYS.start]
+    arm_b = lever_b + x[ANTENNA_B]
+    swing_b = cross(rate_b(state), arm_b)
+    turned = matrix_product(to_n, rotation)
+    skew_rows(turned, arm_b, -delay, 3, seen.jacobian, GYRO_BIAS.start)
+    skew_rows(turned, mean_rate_b(state), -delay, 3, seen.jacobian, ANTENNA_ERROR.start)
+    for i in range(3):
+        along = 0.0
+        for j in range(3):
+            seen.jacobian[i, VELOCITY.start + j] = to_n[i, j] * -delay
+            seen.jacobian[i, ANTENNA_ERROR.start + j] += turned[i, j]
+            along += to_n[i, j] * x[VELOCITY_E.start + j] + turned[i, j] * swing_b[j]
+        seen.jacobian[i, DELAYS_ERROR.start] = -along
+    return times(rotation, arm_b - swing_b * delay)

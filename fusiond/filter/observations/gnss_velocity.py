@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from fusiond.config.schema import Gnss, calibrated
 from fusiond.events import GnssVelocity
 from fusiond.filter.observations.model import (
     CALIBRATED,
     CORRELATION,
     LEVER_ARM_B,
-    PARAMETERS,
+    RESETS,
     SPEED_LIMIT,
     Observation,
+    begin,
+    empty_row,
     mat_eb,
     mean_rate_b,
     rate_b,
+    skew_rows,
     within,
 )
 from fusiond.filter.state import (
@@ -35,10 +36,10 @@ from fusiond.filter.state import (
     VELOCITY_E,
     FilterState,
 )
-from fusiond.filter.strapdown import EARTH_RATE_SKEW
 from fusiond.maths.portable import square
-from fusiond.maths.rotation import skew
-from fusiond.maths.wgs84 import Array, gravity_e, mat_ne
+from fusiond.maths.rotation import cross, matrix_product, times
+from fusiond.maths.typed import Array, Matrix3, Vector, Vector3, compiled
+from fusiond.maths.wgs84 import EARTH_RATE, gravity_e, mat_ne
 
 VELOCITY_N = slice(0, 3)  # m/s, values
 VARIANCE = 3  # (m/s)^2, values
@@ -46,10 +47,11 @@ AXES = 4  # values: 3, or 2 where the receiver gives no vertical speed
 
 
 def parameters(gnss: Gnss) -> Array:
-    row = np.zeros(PARAMETERS)
+    row = empty_row()
     row[LEVER_ARM_B] = gnss.lever_arm_m
     row[CORRELATION] = gnss.velocity_correlation_s
     row[CALIBRATED] = float(calibrated(gnss))
+    row[RESETS] = VELOCITY.start
     return row
 
 
@@ -62,41 +64,61 @@ def values(velocity: GnssVelocity, gnss: Gnss) -> tuple[float, ...]:
     return velocity.north, velocity.east, velocity.down, variance, 3.0
 
 
-def least_speed(row: Array) -> float:
-    """The least horizontal speed [m/s] that a reading leaves possible: three sigmas below it."""
+@compiled
+def lowest_speed(row: Vector) -> float:
+    """The lowest horizontal speed [m/s] that a reading leaves possible: three sigmas below it."""
     return math.sqrt(row[0] * row[0] + row[1] * row[1]) - 3 * math.sqrt(row[VARIANCE])
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+@compiled
+def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
     """Innovation (2,) or (3,) [m/s], north-east(-down). A delay that is a state takes the velocity back along the
     acceleration; what the lever arm swings is taken as constant over it."""
+    x = state.nominal
     axes = int(row[AXES])
-    to_n = mat_ne(state.nominal[POSITION_E])[:axes]
+    to_n = mat_ne(x[POSITION_E])
     rotation = mat_eb(state)
-    lever_b = parameter[LEVER_ARM_B]
-    if parameter[CALIBRATED]:
-        lever_b = lever_b + state.nominal[ANTENNA_B]
-    swing_e = rotation @ np.cross(rate_b(state), lever_b)
-    jacobian = np.zeros((axes, state.size))
-    jacobian[:, VELOCITY] = to_n
-    jacobian[:, GYRO_BIAS] = to_n @ rotation @ skew(lever_b)
-    if parameter[CALIBRATED]:
-        swing_e = swing_e - _gained(state, to_n, rotation, jacobian)
-    jacobian[:, ATTITUDE] -= to_n @ skew(swing_e)
-    innovation = row[VELOCITY_N][:axes] - to_n @ (state.nominal[VELOCITY_E] + swing_e)
-    return Observation(innovation, jacobian, np.full(axes, row[VARIANCE]))
+    arm_b = parameter[LEVER_ARM_B].copy()
+    if parameter[CALIBRATED] != 0.0:
+        arm_b += x[ANTENNA_B]
+    swing_e = times(rotation, cross(rate_b(state), arm_b))
+    turned = matrix_product(to_n, rotation)
+    begin(seen, axes)
+    for i in range(axes):
+        seen.jacobian[i, VELOCITY] = to_n[i]
+    if parameter[CALIBRATED] != 0.0:
+        swing_e -= _gained(state, to_n, turned, seen)
+    for i in range(axes):
+        seen.jacobian[i, ATTITUDE.start] += -1.0 * (to_n[i, 1] * swing_e[2] - to_n[i, 2] * swing_e[1])
+        seen.jacobian[i, ATTITUDE.start + 1] += -1.0 * (to_n[i, 2] * swing_e[0] - to_n[i, 0] * swing_e[2])
+        seen.jacobian[i, ATTITUDE.start + 2] += -1.0 * (to_n[i, 0] * swing_e[1] - to_n[i, 1] * swing_e[0])
+    skew_rows(turned, arm_b, 1.0, axes, seen.jacobian, GYRO_BIAS.start)
+    predicted_n = times(to_n, x[VELOCITY_E] + swing_e)
+    for i in range(axes):
+        seen.innovation[i] = row[i] - predicted_n[i]
+        seen.variance[i] = row[VARIANCE]
+    return True
 
 
-def _gained(state: FilterState, to_n: Array, rotation: Array, jacobian: Array) -> Array:
+@compiled
+def _gained(state: FilterState, to_n: Matrix3, turned: Matrix3, seen: Observation) -> Vector3:
     """The velocity (3,) [m/s, e axes] that was gained since the delay began; fills the jacobian's columns of lever arm,
     delays, velocity and accelerometer bias, and what of the attitude's does not turn with the specific force."""
     x = state.nominal
-    delay = float(x[DELAYS.start] + x[DELAYS.start + 1])
-    force_e = rotation @ (state.auxiliary[SMOOTH_FORCE_B] - x[ACCEL_BIAS_B])
-    rest = gravity_e(x[POSITION_E]) - 2 * EARTH_RATE_SKEW @ x[VELOCITY_E]
-    jacobian[:, VELOCITY] += to_n @ EARTH_RATE_SKEW * (2 * delay)
-    jacobian[:, ACCEL_BIAS] = to_n @ rotation * delay
-    jacobian[:, ANTENNA_ERROR] = to_n @ rotation @ skew(mean_rate_b(state))
-    jacobian[:, DELAYS_ERROR] = np.outer(-to_n @ (force_e + rest), np.ones(2))
-    jacobian[:, ATTITUDE] = -to_n @ skew(rest) * delay
-    return (force_e + rest) * delay
+    delay = x[DELAYS.start] + x[DELAYS.start + 1]
+    force_e = times(mat_eb(state), state.auxiliary[SMOOTH_FORCE_B] - x[ACCEL_BIAS_B])
+    rest_e = gravity_e(x[POSITION_E])  # less 2 omega_ie x v, with omega_ie along z
+    rest_e[0] += 2 * EARTH_RATE * x[VELOCITY_E.start + 1]
+    rest_e[1] -= 2 * EARTH_RATE * x[VELOCITY_E.start]
+    skew_rows(turned, mean_rate_b(state), 1.0, seen.m, seen.jacobian, ANTENNA_ERROR.start)
+    skew_rows(to_n, rest_e, -delay, seen.m, seen.jacobian, ATTITUDE.start)
+    for i in range(seen.m):
+        along = 0.0
+        for j in range(3):
+            along += to_n[i, j] * (force_e[j] + rest_e[j])
+            seen.jacobian[i, ACCEL_BIAS.start + j] = turned[i, j] * delay
+        seen.jacobian[i, DELAYS_ERROR.start] = -along
+        seen.jacobian[i, DELAYS_ERROR.start + 1] = -along
+        seen.jacobian[i, VELOCITY.start] += to_n[i, 1] * (2 * EARTH_RATE * delay)
+        seen.jacobian[i, VELOCITY.start + 1] -= to_n[i, 0] * (2 * EARTH_RATE * delay)
+    return (force_e + rest_e) * delay

@@ -1,13 +1,13 @@
-"""What every observation model shares: its result, the plan of one source, and the kinematics of a point of the vehicle.
+"""What every observation model shares: its result, the rows of numbers it works on, the kinematics of a point of the body.
 
 A model is a pure function of the filter state, a row of values (the measurement) and a row of parameters (the source's
-configuration). It returns an `Observation`, or a reason why there is none.
+configuration). It fills an `Observation`, or returns False where there is nothing to observe. Its `values` and `parameters`
+make those rows; they run in the interpreter, once a measurement and once a configuration.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,19 +26,27 @@ from fusiond.filter.state import (
     FilterState,
 )
 from fusiond.maths.portable import sin_cos
-from fusiond.maths.rotation import matrix, skew
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.rotation import cross, matrix, times, transposed_times
+from fusiond.maths.typed import Array, ErrorRows3, Matrix3, Vector3, compiled
 
 VALUES = 8  # width of a measurement's row
 PARAMETERS = 16  # width of a source's row
 SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
 LEVER_ARM_B = slice(0, 3)  # parameters that models share: m, the sensor from the IMU
-CORRELATION = 3  # s, over which the sensor's errors stay alike
-NOISE_LEAST, NOISE_MOST = 8, 9  # learnt variance over the configured one: its bounds
-SHARED = 10  # by what an error shared with others of a group multiplies the variance
-COMPANION = 11  # place of the source that must be trusted as well, or -1
-CLUTTER = 12  # share of readings that are anywhere; 0: the gate decides
+CORRELATION = 3  # s, over which the sensor's errors stay correlated
 CALIBRATED = 4  # 1 where lever arm and delays of this receiver are states of the filter
+NOISE_MIN, NOISE_MAX = 8, 9  # learnt variance over the configured one: its bounds
+SHARED = 10  # by what an error shared with others of a group multiplies the variance
+COMPANION = 11  # index of the source that must be trusted as well, or -1
+CLUTTER = 12  # share of readings that are anywhere; 0: the gate decides
+RESETS = 13  # first error state of the block that the source resets when it was locked out, or -1
+
+
+def empty_row() -> Array:
+    """A source's row of parameters, before its model fills it."""
+    row = np.zeros(PARAMETERS)
+    row[COMPANION] = row[RESETS] = -1
+    return row
 
 
 class Unusable(Exception):
@@ -52,58 +60,108 @@ def within(values: tuple[float, ...], limit: float, complaint: str) -> None:
             raise Unusable(complaint if math.isfinite(value) else "not finite")
 
 
-class Observation(NamedTuple):
-    """innovation d = z - h(x) : (m,), jacobian = d h / d error : (m, n), variance of z : (m,), independent axes."""
+class Observation:
+    """What a model observes, on `m` axes, at most three; the rest of the memory is not used.
 
-    innovation: Array
-    jacobian: Array
-    variance: Array
+    innovation d = z - h(x) : (3,), jacobian = d h / d error : (3, n), variance of z : (3,), independent axes.
+    """
+
+    __slots__ = ("innovation", "jacobian", "m", "variance")
+
+    def __init__(self, size: int) -> None:
+        """Room for `size` error states."""
+        self.m = 0
+        self.innovation: Array = np.zeros(3)
+        self.jacobian: Array = np.zeros((3, size))
+        self.variance: Array = np.zeros(3)
+
+    @classmethod
+    def of(cls, innovation: Array, jacobian: Array, variance: Array) -> Observation:
+        """One of (m,), (m, n), (m,)."""
+        seen = cls(jacobian.shape[1])
+        seen.m = len(innovation)
+        seen.innovation[: seen.m], seen.jacobian[: seen.m], seen.variance[: seen.m] = innovation, jacobian, variance
+        return seen
+
+    def trimmed(self) -> tuple[Array, Array, Array]:
+        """Innovation (m,), jacobian (m, n) and variance (m,)."""
+        return self.innovation[: self.m], self.jacobian[: self.m], self.variance[: self.m]
 
 
-def with_rate_noise(state: FilterState, seen: Observation) -> Observation:
-    """The angular rate enters over a lever arm: its white noise does as well, as its bias would."""
-    by_rate = seen.jacobian[:, GYRO_BIAS]
-    return seen._replace(variance=seen.variance + state.auxiliary[RATE_VARIANCE] * np.einsum("ij,ij->i", by_rate, by_rate))
+@compiled
+def begin(seen: Observation, axes: int) -> None:
+    """Make room for an observation on so many axes, with a jacobian of zeros."""
+    seen.m = axes
+    for a in range(axes):
+        seen.jacobian[a] = 0.0
 
 
-def mean_rate_b(state: FilterState) -> Array:
+@compiled
+def skew_rows(rows: Matrix3, v: Vector3, factor: float, axes: int, jacobian: ErrorRows3, column: int) -> None:
+    """jacobian[:axes, column : column + 3] = factor * rows[:axes] @ skew(v)."""
+    for i in range(axes):
+        jacobian[i, column] = factor * (rows[i, 1] * v[2] - rows[i, 2] * v[1])
+        jacobian[i, column + 1] = factor * (rows[i, 2] * v[0] - rows[i, 0] * v[2])
+        jacobian[i, column + 2] = factor * (rows[i, 0] * v[1] - rows[i, 1] * v[0])
+
+
+@compiled
+def with_rate_noise(state: FilterState, seen: Observation) -> None:
+    """The angular rate enters over a lever arm: add its white noise, which enters as its bias does."""
+    for a in range(seen.m):
+        by = seen.jacobian[a, GYRO_BIAS]
+        seen.variance[a] += state.auxiliary[RATE_VARIANCE] * (by[0] * by[0] + by[1] * by[1] + by[2] * by[2])
+
+
+@compiled
+def mean_rate_b(state: FilterState) -> Vector3:
     """Mean angular rate (3,) [rad/s] of the last half second, freed of bias: for derivatives. The noise of the rate itself
     is in the innovation too, or looks like motion: their product would be a bias, or knowledge that is none."""
-    rate: Array = state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
-    return rate
+    return state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
 
 
-def mat_eb(state: FilterState) -> Array:
+@compiled
+def mat_eb(state: FilterState) -> Matrix3:
+    """Rotation (3, 3) from body to earth-fixed axes."""
     return matrix(state.nominal[QUATERNION_EB])
 
 
-def rate_b(state: FilterState) -> Array:
+@compiled
+def rate_b(state: FilterState) -> Vector3:
     """Angular rate (3,) [rad/s] at the state's instant, freed of bias."""
-    rate: Array = state.auxiliary[RATE_B] - state.nominal[GYRO_BIAS_B]
-    return rate
+    return state.auxiliary[RATE_B] - state.nominal[GYRO_BIAS_B]
 
 
-def mat_vb(pitch: float, yaw: float) -> tuple[Array, Array, Array]:
-    """Rotation (3, 3) from body to vehicle axes, Rz(yaw) Ry(pitch), and its derivatives by pitch and by yaw."""
-    (sp, cp), (sy, cy) = sin_cos(pitch), sin_cos(yaw)
-    rotation = np.array([[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, 0.0, cp]])
-    by_pitch = np.array([[-cy * sp, 0.0, cy * cp], [-sy * sp, 0.0, sy * cp], [-cp, 0.0, -sp]])
-    by_yaw = np.array([[-sy * cp, -cy, -sy * sp], [cy * cp, -sy, cy * sp], [0.0, 0.0, 0.0]])
-    return rotation, by_pitch, by_yaw
-
-
-def point_velocity_v(state: FilterState, point_b: Array) -> tuple[Array, Array]:
-    """Velocity over ground (3,) [m/s] in vehicle axes of a point (3,) [m] fixed to the body, and its derivative (3, n) by
-    the error state. The Earth's own rotation over a lever arm (0.07 mm/s at 1 m) is left out."""
+@compiled
+def point_velocity_v(state: FilterState, point_b: Vector3, axes: int, jacobian: ErrorRows3) -> Vector3:
+    """Velocity over ground (3,) [m/s] in vehicle axes (those of the body turned by the mount, Rz(yaw) Ry(pitch)) of a point
+    (3,) [m] fixed to the body; the first `axes` rows of its derivative by the error state go into `jacobian`. The Earth's
+    rotation over a lever arm (0.07 mm/s at 1 m) is left out."""
     x = state.nominal
-    rotation_eb = mat_eb(state)
-    velocity_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(rate_b(state), point_b)
-    rotation_vb, by_pitch, by_yaw = mat_vb(float(x[MOUNT.start]), float(x[MOUNT.start + 1]))
-    jacobian = np.zeros((3, state.size))
-    jacobian[:, VELOCITY] = rotation_vb @ rotation_eb.T
-    jacobian[:, ATTITUDE] = rotation_vb @ rotation_eb.T @ skew(x[VELOCITY_E])
-    jacobian[:, GYRO_BIAS] = rotation_vb @ skew(point_b)
-    smooth_b = rotation_eb.T @ x[VELOCITY_E] + np.cross(mean_rate_b(state), point_b)
-    jacobian[:, MOUNT_ERROR.start] = by_pitch @ smooth_b
-    jacobian[:, MOUNT_ERROR.start + 1] = by_yaw @ smooth_b
-    return rotation_vb @ velocity_b, jacobian
+    c = matrix(x[QUATERNION_EB])
+    swing_b = cross(rate_b(state), point_b)
+    along_b = transposed_times(c, x[VELOCITY_E])
+    velocity_b = along_b + swing_b
+    sp, cp = sin_cos(x[MOUNT.start])
+    sy, cy = sin_cos(x[MOUNT.start + 1])
+    mat_vb = np.array([[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, 0.0, cp]])
+    turned = np.empty((3, 3))  # mat_vb @ mat_eb.T
+    for i in range(axes):
+        jacobian[i] = 0.0
+        for j in range(3):
+            turned[i, j] = mat_vb[i, 0] * c[j, 0] + mat_vb[i, 1] * c[j, 1] + mat_vb[i, 2] * c[j, 2]
+        jacobian[i, VELOCITY] = turned[i]
+    skew_rows(turned, x[VELOCITY_E], 1.0, axes, jacobian, ATTITUDE.start)
+    skew_rows(mat_vb, point_b, 1.0, axes, jacobian, GYRO_BIAS.start)
+    mean_b = along_b + cross(mean_rate_b(state), point_b)
+    by_mount = np.array(
+        [
+            [-cy * sp * mean_b[0] + cy * cp * mean_b[2], -sy * cp * mean_b[0] - cy * mean_b[1] - sy * sp * mean_b[2], 0.0],
+            [-sy * sp * mean_b[0] + sy * cp * mean_b[2], cy * cp * mean_b[0] - sy * mean_b[1] + cy * sp * mean_b[2], 0.0],
+            [-cp * mean_b[0] - sp * mean_b[2], 0.0, 0.0],
+        ]
+    )
+    for i in range(axes):
+        jacobian[i, MOUNT_ERROR.start] = by_mount[i, 0]
+        jacobian[i, MOUNT_ERROR.start + 1] = by_mount[i, 1]
+    return times(mat_vb, velocity_b)

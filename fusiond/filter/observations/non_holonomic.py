@@ -3,31 +3,50 @@ Dissanayake et al. (2001), here with the mount misalignment of the IMU."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusiond.config.schema import Motion
-from fusiond.filter.observations.model import LEVER_ARM_B, PARAMETERS, Observation, point_velocity_v
+from fusiond.filter.observations.model import LEVER_ARM_B, Observation, empty_row, point_velocity_v
 from fusiond.filter.state import FilterState
 from fusiond.maths.portable import square
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array, Vector, Vector3, compiled
 
 LATERAL_VARIANCE, VERTICAL_VARIANCE = 3, 4  # (m/s)^2, parameters
-LEAST_SPEED = 5  # m/s, parameters
+MIN_SPEED = 5  # m/s, parameters
 
 
 def parameters(motion: Motion) -> Array:
-    row = np.zeros(PARAMETERS)
+    row = empty_row()
     row[LEVER_ARM_B] = motion.point_m
     row[LATERAL_VARIANCE] = square(motion.lateral_sigma_mps)
     row[VERTICAL_VARIANCE] = square(motion.vertical_sigma_mps)
-    row[LEAST_SPEED] = motion.minimum_speed_mps
+    row[MIN_SPEED] = motion.minimum_speed_mps
     return row
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation | None:
-    """Innovation (2,) [m/s], vehicle axes right and down; None below the least speed. There are no values."""
-    velocity_v, by_error = point_velocity_v(state, parameter[LEVER_ARM_B])
-    if abs(velocity_v[0]) < parameter[LEAST_SPEED]:
-        return None
-    variance = np.array([parameter[LATERAL_VARIANCE], parameter[VERTICAL_VARIANCE]])
-    return Observation(-velocity_v[1:], by_error[1:], variance)
+@compiled
+def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
+    """Innovation (2,) [m/s], vehicle axes right and down; nothing below the least speed. There are no values."""
+    velocity_v = _observe(state, parameter, seen)
+    return abs(velocity_v[0]) >= parameter[MIN_SPEED]
+
+
+@compiled
+def observe_at_any_speed(state: FilterState, parameter: Vector, seen: Observation) -> float:
+    """The same at whatever speed; returns the speed over ground [m/s], in whatever direction."""
+    velocity_v = _observe(state, parameter, seen)
+    return math.sqrt(velocity_v[0] * velocity_v[0] + velocity_v[1] * velocity_v[1])
+
+
+@compiled
+def _observe(state: FilterState, parameter: Vector, seen: Observation) -> Vector3:
+    by = np.empty((3, state.size))
+    velocity_v = point_velocity_v(state, parameter[LEVER_ARM_B], 3, by)
+    seen.m = 2
+    for i in range(2):
+        seen.jacobian[i] = by[1 + i]
+        seen.innovation[i] = -velocity_v[1 + i]
+    seen.variance[0], seen.variance[1] = parameter[LATERAL_VARIANCE], parameter[VERTICAL_VARIANCE]
+    return velocity_v

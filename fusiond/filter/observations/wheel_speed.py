@@ -12,22 +12,30 @@ import numpy as np
 
 from fusiond.config.schema import Wheel
 from fusiond.events import WheelSpeed
-from fusiond.filter.observations.model import LEVER_ARM_B, PARAMETERS, SPEED_LIMIT, Observation, point_velocity_v, within
+from fusiond.filter.observations.model import (
+    LEVER_ARM_B,
+    SPEED_LIMIT,
+    Observation,
+    empty_row,
+    point_velocity_v,
+    within,
+)
 from fusiond.filter.state import SCALE, FilterState
+from fusiond.maths.linear import dot
 from fusiond.maths.portable import exp, square
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array, Vector, compiled
 
-SPEED, VARIANCE, ALIKE = 0, 1, 2  # m/s, (m/s)^2, s over which errors stay alike: values
+SPEED, VARIANCE, CORRELATED = 0, 1, 2  # m/s, (m/s)^2, s over which errors stay correlated: values
 STEERED, UNSIGNED = 4, 5  # parameters: 1 or 0
 SCALE_STATE = 6  # parameters: the error state of its scale; the nominal state is one higher
-SLOW_ALIKE = 1.0  # s: for so long at least a slow wheel is slow alike
+SLOW_CORRELATION = 1.0  # s: a slow wheel stays slow at least this long
 SURE_SPEED = 2.0  # m/s: a speed beyond this leaves no doubt of its direction
-DIRECTION_ALIKE = 100.0  # readings: so many share their direction, so they tell no more of it than one
-LEAST_TRACK_SPEED = 0.5  # m/s: below this the direction of a steered wheel's track is not known, and it is taken as forward
+SAME_DIRECTION = 100.0  # readings that share their direction, and so are worth no more than one about it
+MIN_TRACK_SPEED = 0.5  # m/s: below this the direction of a steered wheel's track is not known, and it is taken as forward
 
 
 def parameters(wheel: Wheel) -> Array:
-    row = np.zeros(PARAMETERS)
+    row = empty_row()
     row[LEVER_ARM_B] = wheel.position_m
     row[STEERED] = float(wheel.steered)
     row[UNSIGNED] = float(wheel.unsigned and wheel.direction_signal is None)
@@ -44,39 +52,64 @@ def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
         within((speed,), SPEED_LIMIT, "impossible speed")
     variance = sigma * sigma + quantum * quantum / 12 + own * own
     if -wheel.least_mps < speed < wheel.least_mps:
-        return speed, variance + square(wheel.least_mps) / 3, max(wheel.correlation_s, SLOW_ALIKE)
+        return speed, variance + square(wheel.least_mps) / 3, max(wheel.correlation_s, SLOW_CORRELATION)
     return speed, variance, wheel.correlation_s
 
 
-def observe(state: FilterState, row: Array, parameter: Array, certain: bool = False) -> Observation:
-    """Innovation (1,) [m/s]: reading less (1 + scale) times the contact point's speed. With `certain` the state is taken at
-    its word: an unsigned wheel turns the way that it says."""
-    velocity_v, by_error = point_velocity_v(state, parameter[LEVER_ARM_B])
-    forward, sideways = float(velocity_v[0]), float(velocity_v[1])
-    along = np.array([1.0, 0.0, 0.0])
+@compiled
+def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
+    """Innovation (1,) [m/s]: reading less (1 + scale) times the contact point's speed."""
+    return _observe(state, row, parameter, seen, False)
+
+
+@compiled
+def observe_certain(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
+    """The same, but the state is taken at its word: an unsigned wheel turns the way that it says."""
+    return _observe(state, row, parameter, seen, True)
+
+
+@compiled
+def _observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation, certain: bool) -> bool:
+    steered = parameter[STEERED] != 0.0
+    by = np.empty((3, state.size))
+    velocity_v = point_velocity_v(state, parameter[LEVER_ARM_B], 2 if steered else 1, by)
+    forward, sideways = velocity_v[0], velocity_v[1]
     speed = forward
-    track = math.sqrt(forward * forward + sideways * sideways)
-    if parameter[STEERED] and track > LEAST_TRACK_SPEED:
-        speed = math.copysign(track, forward)
-        along = np.array([forward / speed, sideways / speed, 0.0])
     which = int(parameter[SCALE_STATE])
     scale = 1 + state.nominal[which + 1]
-    jacobian = scale * (along @ by_error)
+    jacobian = seen.jacobian[0]
+    track = math.sqrt(forward * forward + sideways * sideways)
+    if steered and track > MIN_TRACK_SPEED:
+        speed = track if forward >= 0 else -track
+        along, across = forward / speed, sideways / speed
+        jacobian[:] = scale * (along * by[0] + across * by[1])
+    else:
+        jacobian[:] = scale * by[0]
     jacobian[which] = speed
     reading, variance = row[SPEED], row[VARIANCE]
-    if parameter[UNSIGNED] and reading > 0:
+    if parameter[UNSIGNED] != 0.0 and reading > 0:
         if certain or abs(speed) > SURE_SPEED:
-            reading = math.copysign(reading, speed)
+            if speed < 0:
+                reading = -reading
         else:
-            spread = float(jacobian @ state.covariance @ jacobian) + variance
+            reach = np.zeros(state.size)  # P H'
+            for k in range(state.size):
+                if jacobian[k] != 0.0:
+                    reach += jacobian[k] * state.covariance[k]
+            spread = variance + dot(jacobian, reach)
             sure = direction(reading * scale * speed / spread)
-            variance += DIRECTION_ALIKE * reading * reading * (1 - sure * sure)
+            variance += SAME_DIRECTION * reading * reading * (1 - sure * sure)
             reading *= sure
-    return Observation(np.array([reading - scale * speed]), jacobian.reshape(1, -1), np.array([variance]))
+    seen.m = 1
+    seen.innovation[0] = reading - scale * speed
+    seen.variance[0] = variance
+    return True
 
 
+@compiled
 def direction(odds: float) -> float:
     """Mean sign of an unsigned reading z, with a speed of mean h and variance S - R behind it: the two signs weighed by
     their likelihoods, tanh(z h / S); `odds` is z h / S."""
-    alike = exp(-2 * abs(odds))
-    return math.copysign((1 - alike) / (1 + alike), odds)
+    other = exp(-2 * abs(odds))
+    sure = (1 - other) / (1 + other)
+    return -sure if odds < 0 else sure

@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from fusiond.config.schema import Motion
-from fusiond.filter.observations.model import PARAMETERS, Observation, mat_eb
+from fusiond.filter.observations.model import Observation, begin, empty_row, mat_eb
 from fusiond.filter.state import ATTITUDE, GYRO_BIAS, GYRO_BIAS_B, RATE_B, FilterState
-from fusiond.filter.strapdown import EARTH_RATE_E
 from fusiond.maths.portable import square
-from fusiond.maths.rotation import skew
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array, Vector, compiled
+from fusiond.maths.wgs84 import EARTH_RATE
 
 VARIANCE = 0  # (rad/s)^2, parameters
 
 
 def parameters(motion: Motion) -> Array:
-    row = np.zeros(PARAMETERS)
+    row = empty_row()
     row[VARIANCE] = square(math.radians(motion.zero_rotation_sigma_deg_s))
     return row
 
 
-def observe(state: FilterState, row: Array, parameter: Array) -> Observation:
+@compiled
+def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
     """Innovation (3,) [rad/s], body axes. There are no values."""
-    rotation = mat_eb(state)
-    jacobian = np.zeros((3, state.size))
-    jacobian[:, GYRO_BIAS] = np.eye(3)
-    jacobian[:, ATTITUDE] = rotation.T @ skew(EARTH_RATE_E)
-    innovation = state.auxiliary[RATE_B] - state.nominal[GYRO_BIAS_B] - rotation.T @ EARTH_RATE_E
-    return Observation(innovation, jacobian, np.full(3, parameter[VARIANCE]))
+    c = mat_eb(state)
+    begin(seen, 3)
+    for i in range(3):
+        seen.jacobian[i, GYRO_BIAS.start + i] = 1.0
+        seen.jacobian[i, ATTITUDE.start] = c[1, i] * EARTH_RATE  # mat_eb' skew(omega_ie), with omega_ie along z
+        seen.jacobian[i, ATTITUDE.start + 1] = -(c[0, i] * EARTH_RATE)
+        turned = state.auxiliary[RATE_B.start + i] - state.nominal[GYRO_BIAS_B.start + i]
+        seen.innovation[i] = turned - c[2, i] * EARTH_RATE
+        seen.variance[i] = parameter[VARIANCE]
+    return True

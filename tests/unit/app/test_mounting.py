@@ -19,7 +19,7 @@ from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.events import Invalid, Measurement
 from fusiond.maths.rotation import matrix_from_euler
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import parse
 from fusiond.timeline.clock import Clock
 from fusiond_adapters.logs.merge import open_logs

@@ -11,8 +11,8 @@ import pytest
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, ImuSample, Invalid, Measurement, Payload, WheelSpeed
+from fusiond.filter.rows import Outcome
 from fusiond.filter.state import NEVER, T_IMU, T
-from fusiond.filter.step import Outcome
 from tests.conftest import needs_compiled
 from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
 

@@ -13,7 +13,8 @@ from fusiond.events import GnssVelocity, Measurement
 from fusiond.filter.heading_bank import alive, difference, normalise
 from fusiond.filter.measurement_update import inject
 from fusiond.filter.state import ATTITUDE, CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
-from fusiond.maths.wgs84 import Array, mat_ne
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.streams import SECOND, T0, Drive, config, drive, fuse, measurements, running_state
 

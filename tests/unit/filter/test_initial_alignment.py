@@ -11,6 +11,7 @@ import pytest
 from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
+from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
     ALIGNING,
     BLOWN,
@@ -26,7 +27,7 @@ from fusiond.filter.state import (
     VELOCITY_E,
     T,
 )
-from fusiond.filter.step import LOST_HEADING, Outcome, yaw_variance
+from fusiond.filter.step import LOST_HEADING, yaw_variance
 from fusiond.maths.rotation import euler, matrix, matrix_from_euler
 from tests.conftest import needs_compiled
 from tests.helpers.streams import MS, SECOND, T0, Drive, config, drive, fuse, measurements

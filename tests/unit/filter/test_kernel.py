@@ -18,10 +18,12 @@ import pytest
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
+from fusiond.filter.kernel.interpreted import Kernel, compiled_available, make_kernel
 from fusiond.filter.measurement import SUSPECT
 from fusiond.filter.north_east_down import COVARIANCE_N, GEODETIC, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations.model import mat_eb
 from fusiond.filter.parameters import plan
+from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
     CONSTRAINT_FUSED,
     ERROR_SIZE,
@@ -46,7 +48,6 @@ from fusiond.filter.state import (
     WIDE_SIZE,
     FilterState,
 )
-from fusiond.filter.step import Kernel, Outcome, compiled_available, make_kernel
 from fusiond.maths.rotation import matrix
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
 from tests.conftest import needs_compiled
@@ -346,7 +347,7 @@ CHILD = """
 import hashlib, math, pickle, sys
 import numpy as np
 from tests.helpers.streams import config, fuse, SECOND, T0
-from fusiond.filter.step import compiled_available
+from fusiond.filter.kernel.interpreted import compiled_available
 events = pickle.load(open(sys.argv[1], "rb"))
 numbers = [k * 1.2345e-5 for k in range(1, 100000)]
 library = hashlib.sha256(repr([x ** 2 for x in numbers] + [math.exp(-x) for x in numbers]).encode())

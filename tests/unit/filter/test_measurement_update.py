@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from fusiond.events import GnssPosition, Measurement
-from fusiond.filter.measurement_update import chi_square, cholesky, correlation_factor, solve, update
 from fusiond.filter.observations.model import Observation
 from fusiond.filter.parameters import plan
 from fusiond.filter.state import ATTITUDE, NEVER, POSITION, POSITION_E, SCALE, WHEEL_SCALE, FilterState
 from fusiond.filter.strapdown import coast
-from fusiond.maths.wgs84 import Array, geodetic
+from fusiond.maths.statistics import chi_square, cholesky, correlation_factor, solve, update
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import geodetic
 from tests.helpers.streams import T0, apply, config, running_state
 
 ALWAYS = math.inf  # a gate that lets everything pass

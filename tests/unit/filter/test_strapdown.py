@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement
+from fusiond.filter.kernel.interpreted import AnyKernel, make_kernel
 from fusiond.filter.measurement_update import inject
 from fusiond.filter.parameters import plan
 from fusiond.filter.state import (
@@ -24,10 +25,10 @@ from fusiond.filter.state import (
     VELOCITY_E,
     FilterState,
 )
-from fusiond.filter.step import AnyKernel, make_kernel
 from fusiond.filter.strapdown import COAST_ACCEL, COAST_TILT, COAST_TURN
 from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion, quaternion_exp, quaternion_multiply
-from fusiond.maths.wgs84 import SEMI_MINOR, Array, ecef, geodetic, gravity_e, mat_ne
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import SEMI_MINOR, ecef, geodetic, gravity_e, mat_ne
 from tests.helpers.streams import EARTH_RATE_E, MS, MUNICH, SECOND, T0, config, fuse, running_state, triple
 
 TENTH_MM = 1e-4  # m

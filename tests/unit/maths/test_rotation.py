@@ -18,7 +18,7 @@ from fusiond.maths.rotation import (
     quaternion_multiply,
     skew,
 )
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 
 RNG = np.random.default_rng(1)
 VECTORS = [RNG.normal(0.0, size, 3) for size in (1e-9, 1e-5, 1e-4, 1e-3, 0.3, 1.0) for _ in range(20)]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import run
-from fusiond.filter.step import compiled_available
+from fusiond.filter.kernel.interpreted import compiled_available
 
 ROWS = [
     "predict: one propagation",

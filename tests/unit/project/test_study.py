@@ -11,7 +11,7 @@ from benchmarks.study.runs import Ledger, drive, error, started
 from benchmarks.study.world import GNSS_NAME, Fault, Sensors, World
 from fusiond.estimator.fusion import Fusion
 from fusiond.filter.state import ATTITUDE, POSITION, VELOCITY
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from tests.conftest import needs_compiled
 
 SMALL = 1e-6

@@ -9,7 +9,7 @@ import pytest
 
 from fusiond.maths import wgs84 as earth
 from fusiond.maths.rotation import matrix, quaternion_exp
-from fusiond.maths.wgs84 import Array
+from fusiond.maths.typed import Array
 from fusiond.simulation import wgs84, wheels
 from fusiond.simulation.drive import Drive, simulate
 from fusiond.simulation.scenario import Scenario, parse

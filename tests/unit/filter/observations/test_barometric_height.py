@@ -14,9 +14,11 @@ from fusiond.config.toml import ConfigError
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, Measurement, Pressure
 from fusiond.filter.calibration import calibrations
+from fusiond.filter.kernel.interpreted import compiled_available
 from fusiond.filter.observations import barometric_height
 from fusiond.filter.observations.barometric_height import LAYERS, pressure_altitude
 from fusiond.filter.observations.model import PARAMETERS, Unusable
+from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
     CHOOSING,
     HEIGHT_OFFSET,
@@ -28,7 +30,6 @@ from fusiond.filter.state import (
     WIDE_SIZE,
     FilterState,
 )
-from fusiond.filter.step import Outcome, compiled_available
 from fusiond.maths.wgs84 import ecef
 from fusiond.simulation.scenario import parse as parse_scenario
 from fusiond_adapters.logs.merge import open_logs

@@ -40,7 +40,8 @@ from fusiond.filter.state import (
     FilterState,
 )
 from fusiond.maths.rotation import matrix_from_euler, quaternion
-from fusiond.maths.wgs84 import Array, ecef, mat_ne
+from fusiond.maths.typed import Array
+from fusiond.maths.wgs84 import ecef, mat_ne
 from tests.helpers.streams import EARTH_RATE_E, MUNICH, running_state
 
 GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
