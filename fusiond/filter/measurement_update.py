@@ -209,12 +209,13 @@ def turn_along(p: Covariance, error: ErrorVector) -> None:
     for i in range(6):
         p[i] += -1.0 * turned[i]
     for block in range(0, 6, 3):
-        for i in range(6):  # the others are mirrored
+        for i in range(6):
             x, y, z = p[i, phi], p[i, phi + 1], p[i, phi + 2]
             p[i, block] -= error[block + 1] * z - error[block + 2] * y
             p[i, block + 1] -= error[block + 2] * x - error[block] * z
             p[i, block + 2] -= error[block] * y - error[block + 1] * x
-    mirror(p)
+    for i in range(6):
+        p[i:, i] = p[i, i:]
 
 
 @compiled

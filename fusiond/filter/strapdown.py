@@ -153,9 +153,10 @@ def _grow(p: Covariance, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient:
     corner[7] -= earth_turn * rows[:, 6]
 
     for i in range(9):
-        p[i, CORNER] = corner[:, i]
+        p[i, i : CORNER.stop] = corner[i:, i]
+        p[i : CORNER.stop, i] = corner[i:, i]
         p[i, CORNER.stop :] = rows[i, CORNER.stop :]
-    mirror(p)
+        p[CORNER.stop :, i] = rows[i, CORNER.stop :]
 
 
 @compiled

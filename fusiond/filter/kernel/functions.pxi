@@ -647,11 +647,14 @@ cdef void strapdown__grow(double* p, double dt, double* force_e, double* mat_eb,
     for _i in range(9):
         (corner + (7) * 9)[_i] -= (earth_turn * (rows + 6)[_i * n])
     for i in range(9):
-        for _i in range(9):
-            (p + (i) * n)[_i] = (corner + i)[_i * 9]
+        for _i in range((9 - i)):
+            (p + (i) * n + i)[_i] = (corner + i + (i) * 9)[_i * 9]
+        for _i in range((9 - i)):
+            (p + i + (i) * n)[_i * n] = (corner + i + (i) * 9)[_i * 9]
         for _i in range((n - 9)):
             (p + (i) * n + 9)[_i] = (rows + (i) * n + 9)[_i]
-    linear_mirror(p)
+        for _i in range((n - 9)):
+            (p + i + (9) * n)[_i * n] = (rows + (i) * n + 9)[_i]
 
 cdef void strapdown__add_noise(double* p, double dt, double accel, double gyro, Noise* noise) noexcept nogil:
     cdef double cubic
@@ -1378,7 +1381,9 @@ cdef void measurement_update_turn_along(double* p, double* error) noexcept nogil
             p[(i) * n + block] -= ((error[(block + 1)] * z) - (error[(block + 2)] * y))
             p[(i) * n + (block + 1)] -= ((error[(block + 2)] * x) - (error[block] * z))
             p[(i) * n + (block + 2)] -= ((error[block] * y) - (error[(block + 1)] * x))
-    linear_mirror(p)
+    for i in range(6):
+        for _i in range((n - i)):
+            (p + i + (i) * n)[_i * n] = (p + (i) * n + i)[_i]
 
 cdef double measurement_update_detection(double distance, int64_t m, double clutter) noexcept nogil:
     cdef double density
