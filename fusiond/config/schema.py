@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from msgspec import Meta, field
 
-from fusiond.config.sensor import INERTIAL, Sensor, Stream
+from fusiond.config.sensor import (
+    INERTIAL,
+    Sensor,
+    Stream,
+    delay_in_words,
+    point_in_words,
+    vector_in_words,
+)
 from fusiond.config.toml import Name, Section
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Pressure, WheelSpeed
 
@@ -20,6 +27,10 @@ Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
 Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 Vector = tuple[float, float, float]
 MILLISECOND = 1_000_000  # ns
+WHEEL_DISTANCE = "WHEEL_DISTANCE"  # the MAVLink message of all wheels
+CAN_KEYS = ("message", "signal")  # of a wheel that comes by CAN
+GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
+STAMPS = {"sensor": "by its own stamp", "arrival": "by its arrival"}
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 Encoding = Literal["json", "msgpack"]
 Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
@@ -112,6 +123,9 @@ class Can(Section, frozen=True, kw_only=True):
 class Imu(Sensor, frozen=True, kw_only=True):
     """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
 
+    label: ClassVar[str] = "IMU"
+    required: ClassVar[bool] = True
+
     link: Name  # the [mavlink.LINK] it comes by
     message: ImuMessage = "HIGHRES_IMU"  # the message that carries it
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
@@ -130,9 +144,23 @@ class Imu(Sensor, frozen=True, kw_only=True):
     def streams(self) -> tuple[Stream, ...]:
         return (Stream(INERTIAL, ImuSample, self.delay_ms),)
 
+    def messages(self) -> dict[str, float]:
+        return {self.message: self.rate_hz}
+
+    def origin(self) -> str:
+        return f"{self.message} of {self.link}"
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {delay_in_words(self.delay_ms)}"
+        yield f"turned by {vector_in_words(self.rotation_deg)} deg (roll, pitch, yaw) against forward-right-down"
+        yield f"noise {self.accel_noise:g} m/s^2/sqrt(Hz), {self.gyro_noise:g} rad/s/sqrt(Hz)"
+
 
 class Gnss(Sensor, frozen=True, kw_only=True):
     """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
+
+    label: ClassVar[str] = "GNSS"
+    point: ClassVar[str] = "lever_arm_m"
 
     link: Name  # the [mavlink.LINK] it comes by
     message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"  # the message that carries it
@@ -181,9 +209,26 @@ class Gnss(Sensor, frozen=True, kw_only=True):
         )
         return position, velocity
 
+    def messages(self) -> dict[str, float]:
+        return {self.message: 1 / self.interval_s}
+
+    def origin(self) -> str:
+        return f"{self.message} of {self.link}"
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {STAMPS[self.stamp]}, {delay_in_words(self.delay_ms)}"
+        yield f"feeds {name}.position: sigma {self.position_sigma_m:g} m, in height {self.height_sigma_m:g} m"
+        if self.use_velocity:
+            delay = delay_in_words(self.delay_ms + self.velocity_delay_ms)
+            yield f"feeds {name}.velocity: sigma {self.velocity_sigma_mps:g} m/s, {delay}"
+        yield f"antenna at {point_in_words(self.lever_arm_m)} from the IMU"
+
 
 class Barometer(Sensor, frozen=True, kw_only=True):
     """[barometer.NAME]: a static pressure sensor, taken as a height with an unknown offset. At most one."""
+
+    label: ClassVar[str] = "barometer"
+    only_one: ClassVar[str] = "there is one height offset to learn"
 
     link: Name  # the [mavlink.LINK] it comes by
     message: PressureMessage = "SCALED_PRESSURE"  # the message that carries it
@@ -209,10 +254,23 @@ class Barometer(Sensor, frozen=True, kw_only=True):
             ),
         )
 
+    def messages(self) -> dict[str, float]:
+        return {self.message: self.rate_hz}
+
+    def origin(self) -> str:
+        return f"{self.message} of {self.link}"
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {delay_in_words(self.delay_ms)}"
+        yield f"sigma {self.sigma_m:g} m about a height offset that is learnt"
+
 
 class Wheel(Sensor, frozen=True, kw_only=True):
     """[wheel.NAME]: one wheel; each is a source of its own. By CAN (bus, message, signal) or by MAVLink's WHEEL_DISTANCE
     (link, index)."""
+
+    label: ClassVar[str] = "wheel"
+    point: ClassVar[str] = "position_m"
 
     bus: Name | None = None  # the [can.BUS] it comes by
     message: str | None = None  # message name in the DBC
@@ -259,6 +317,48 @@ class Wheel(Sensor, frozen=True, kw_only=True):
                 noise_max=self.noise_most,
             ),
         )
+
+    def messages(self) -> dict[str, float]:
+        return {} if self.link is None else {WHEEL_DISTANCE: self.rate_hz}
+
+    def origin(self) -> str:
+        if self.link is not None:
+            return f"{WHEEL_DISTANCE}[{self.index}] of {self.link}"
+        return f"{self.message}.{self.signal} of {self.bus}"
+
+    def description(self, name: str) -> Iterator[str]:
+        unit = f" in {self.unit}" if self.bus is not None else ""
+        yield f"{self.origin()}{unit}, {delay_in_words(self.delay_ms)}"
+        kind = "steered" if self.steered else "not steered"
+        sign = "amount only" if self.unsigned and not self.direction_signal else "with direction"
+        factor = f", times {self.scale:g}" if self.scale != 1 else ""
+        yield f"at {point_in_words(self.position_m)}, {kind}, {sign}{factor}, sigma {self.sigma_mps:g} m/s"
+        guards = (
+            (self.valid_signal, f"must be {self.valid_value}"),
+            (self.counter_signal, "must change"),
+            (self.checksum, "checksum must be right"),
+            (self.direction_signal, f"= {self.reverse_value} means backwards"),
+        )
+        told = ", ".join(f"{signal} {rule}" for signal, rule in guards if signal)
+        if told:
+            yield told
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        if (self.bus is None) == (self.link is None):
+            yield "", "one of 'bus' (CAN) and 'link' (MAVLink's WHEEL_DISTANCE) is needed, and not both"
+        needed, others = (CAN_KEYS, ("index",)) if self.link is None else (("index",), CAN_KEYS + GUARD_KEYS)
+        for key in needed:
+            if getattr(self, key) is None:
+                yield "", f"the key '{key}' is missing"
+        for key in others:
+            if getattr(self, key) is not None:
+                yield key, f"has no meaning for a wheel that comes by {'link' if self.link else 'bus'}"
+        if self.link is None and self.quantum_m:
+            yield "quantum_m", "is for wheels that come by link; use quantum_mps"
+        if self.unit in ("rad/s", "rpm") and self.radius_m is None:
+            yield "unit", f"{self.unit} needs radius_m"
+        if self.scale == 0:
+            yield "scale", "must not be 0"
 
 
 class Publish(Section, frozen=True, kw_only=True):
@@ -457,7 +557,7 @@ def sensor_tables() -> dict[str, type[Sensor]]:
     return {table: kind for table, kind in kinds.items() if issubclass(kind, Sensor)}
 
 
-MOST_SCALES = 4
+MAX_SCALES = 4
 
 
 def wheel_groups(config: Config) -> dict[str, int]:

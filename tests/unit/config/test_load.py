@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fusiond.config import load as config
-from fusiond.config.schema import Config
+from fusiond.config.schema import Config, sensor_tables
 from fusiond.config.toml import ConfigError
 
 CAR = Path("/etc/fusiond/car.toml")
@@ -153,6 +153,65 @@ def test_the_fault_is_found_in_the_right_table_of_many() -> None:
 )
 def test_contradictions(text: str, line: int, key: str, parts: list[str]) -> None:
     check(BASE + text, line, key, *parts)
+
+
+SENSORS = {  # a table of each kind of sensor, its last line the input that it comes by
+    "imu.imu0": "link = 'autopilot'",
+    "gnss.gps0": "link = 'autopilot'",
+    "wheel.left": "message = 'm'\nsignal = 's'\nbus = 'chassis'",
+    "wheel.right": "index = 2\nlink = 'autopilot'",
+    "barometer.b": "link = 'autopilot'",
+}
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_typing_error_in_an_input_names_what_was_meant(sensor: str) -> None:
+    others = "[mavlink.radio]\n[mavlink.autopilot]\n[can.chassis]\n"
+    imu = "" if sensor == "imu.imu0" else f"[imu.imu0]\n{SENSORS['imu.imu0']}\n"
+    text = f"{others}{imu}[{sensor}]\n{SENSORS[sensor]}"
+    key, _, name = text.splitlines()[-1].partition(" = ")
+    table, name = {"link": "mavlink", "bus": "can"}[key], name.strip("'")
+    wrong = text.removesuffix("'") + "s'"
+    check(wrong, wrong.count("\n") + 1, f"{sensor}.{key}",
+          f"there is no [{table}.{name}s] (did you mean '{name}'?)", "configured: ", name)  # fmt: skip
+
+
+def test_every_kind_of_sensor_is_tried_with_a_typing_error() -> None:
+    assert {sensor.partition(".")[0] for sensor in SENSORS} == set(sensor_tables())
+
+
+def test_a_name_that_is_like_none_is_only_refused() -> None:
+    assert "did you mean" not in complaint(BASE + GNSS.replace("autopilot", "xyz"))
+
+
+def test_a_typing_error_in_the_link_of_an_output() -> None:
+    for table in ("autopilot", "ground_station"):
+        text = f"[{table}]\nlink = 'autopilto'"
+        check(BASE + text, 5, f"{table}.link", "no [mavlink.autopilto]", "did you mean 'autopilot'?")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "origin"),
+    [
+        ("[gnss.a]\nlink = 'fc'", "[gnss.b]\nlink = 'fc'\nstamp = 'arrival'", "GPS_RAW_INT of fc"),
+        ("[wheel.a]\nlink = 'fc'\nindex = 1", "[wheel.b]\nlink = 'fc'\nindex = 1", "WHEEL_DISTANCE[1] of fc"),
+        (
+            "[wheel.a]\nbus = 'body'\nmessage = 'm'\nsignal = 's'",
+            "[wheel.b]\nbus = 'body'\nmessage = 'm'\nsignal = 's'\nunit = 'mph'",
+            "m.s of body",
+        ),
+    ],
+)
+def test_two_sensors_of_a_kind_cannot_read_the_same(tmp_path: Path, first: str, second: str, origin: str) -> None:
+    (tmp_path / DBC).touch()
+    text = f"[mavlink.fc]\n[mavlink.other]\n[can.body]\ndbc = ['{DBC}']\n[imu.imu0]\nlink = 'fc'\n{first}\n"
+    file = tmp_path / "car.toml"
+    table = second.partition(".")[0].strip("[")
+    message = complaint(text + second, file)
+    assert f": {table}.b: reads the same as [{table}.a]: {origin}" in message
+    for mine, other in (("'fc'", "'other'"), ("index = 1", "index = 2"), ("signal = 's'", "signal = 't'")):
+        if mine in second:
+            assert config.parse(text + second.replace(mine, other), file)
 
 
 def test_no_imu() -> None:
