@@ -26,7 +26,6 @@ from fusiond_adapters.mavlink.decoder import (
     Dialect,
     message_id,
 )
-from fusiond_adapters.mavlink.sensors import WHEEL_DISTANCE
 from fusiond_adapters.mavlink.signing import Signing
 
 SECOND = 1_000_000_000  # ns
@@ -211,11 +210,8 @@ class MavlinkTalk:
 
 
 def _wanted(config: Config, link: str, dialect: Dialect) -> dict[str, Wanted]:
-    """The messages that the configuration takes from a link, with the greatest rate that anyone wants."""
-    rates: list[tuple[str, float]] = [(imu.message, imu.rate_hz) for imu in config.imu.values() if imu.link == link]
-    rates += [(gnss.message, 1 / gnss.interval_s) for gnss in config.gnss.values() if gnss.link == link]
-    rates += [(WHEEL_DISTANCE, wheel.rate_hz) for wheel in config.wheel.values() if wheel.link == link]
-    rates += [(barometer.message, barometer.rate_hz) for barometer in config.barometer.values() if barometer.link == link]
+    """The messages that the configuration takes from a link, each at the highest rate that a sensor wants."""
+    rates = [wanted for _, _, section in config.sensors(link=link) for wanted in section.messages().items()]
     if rates and SYSTEM_TIME in dialect.ids:
         rates.append((SYSTEM_TIME, SYSTEM_TIME_HZ))
     if config.autopilot.link == link:
