@@ -319,7 +319,7 @@ class Wheel(Sensor, frozen=True, kw_only=True):
         )
 
     def messages(self) -> dict[str, float]:
-        return {} if self.link is None else {WHEEL_DISTANCE: self.rate_hz}
+        return {WHEEL_DISTANCE: self.rate_hz} if self.message is None else {self.message: 0.0}
 
     def origin(self) -> str:
         if self.link is not None:

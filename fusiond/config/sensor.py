@@ -44,8 +44,8 @@ class Sensor(Section, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def messages(self) -> dict[str, float]:
-        """The MAVLink messages that it reads, each with the rate [Hz] to ask the autopilot for."""
-        return {}
+        """The messages of its link or bus that it reads, each with the rate [Hz] to ask for; 0 where nobody can be asked."""
+        raise NotImplementedError
 
     def origin(self) -> str:
         """What it reads, in words. Two sensors of one kind must not read the same."""

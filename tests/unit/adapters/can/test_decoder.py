@@ -284,7 +284,7 @@ def test_a_signal_is_what_cantools_decodes(
     (event,) = decoder(folder, wheel(message="M", signal="S", more='unit = "m/s"')).decode(1, False, data, 0)
     message = cantools.database.load_string(text, "dbc").messages[0]
     expected = message.decode_simple(data, decode_choices=False, allow_truncated=True)
-    assert event.payload == (WheelSpeed(expected["S"]) if "S" in expected else Invalid("short frame"))
+    assert event.payload == (WheelSpeed(float(expected["S"])) if "S" in expected else Invalid("short frame"))
     assert "S" in expected or len(data) < size
 
 
