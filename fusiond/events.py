@@ -39,6 +39,13 @@ class GnssVelocity(Struct, frozen=True, gc=False):
     sigma: float | None = None  # m/s, one standard deviation per axis
 
 
+class GnssYaw(Struct, frozen=True, gc=False):
+    """Yaw of the baseline between the two antennas of a GNSS receiver. `sigma` is None where the receiver gives none."""
+
+    yaw: float  # rad, of the baseline, clockwise from north
+    sigma: float | None = None  # rad, one standard deviation
+
+
 class WheelSpeed(Struct, frozen=True, gc=False):
     """Speed of one wheel's circumference along its rolling direction, positive forward."""
 
@@ -70,7 +77,7 @@ class Invalid(Struct, frozen=True, gc=False):
     reason: str
 
 
-Payload = ImuSample | GnssPosition | GnssVelocity | WheelSpeed | Pressure
+Payload = ImuSample | GnssPosition | GnssVelocity | GnssYaw | WheelSpeed | Pressure
 AnyPayload = Payload | ClockPair | Invalid
 
 

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from fusiond.config.schema import Barometer, Config, Gnss, Imu, Wheel
+from fusiond.config.schema import Barometer, Config, DualAntenna, Gnss, Imu, Wheel
 from fusiond.config.sensor import Sensor
 from fusiond.events import (
     AnyPayload,
     GnssPosition,
     GnssVelocity,
+    GnssYaw,
     ImuSample,
     Invalid,
     Pressure,
@@ -24,6 +25,7 @@ from fusiond.events import (
 SECOND = 1_000_000_000  # ns
 MILLI_G = 9.80665e-3  # m/s^2
 UNKNOWN_U16 = 65535
+NORTH = 36000  # centidegrees: a yaw of 0
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 SHORTEST_NS = 2_000_000  # a message that repeats the one before sooner than this is a copy of it
 LONGEST_NS = SECOND  # the mean speed over a longer interval tells little of the speed at its middle
@@ -129,6 +131,35 @@ class GnssHandler:
         return events
 
 
+class GnssYawHandler:
+    """One [dual_antenna.NAME]: fields to GnssYaw.
+
+    By MAVLink 0 says that the receiver gives no yaw; PX4 sends it where there is none for the moment, too. It is counted
+    as invalid, so that a receiver that is not set up for yaw shows in the health.
+    """
+
+    fields = ("time_usec", "fix_type", "hdg_acc", "yaw")
+
+    def __init__(self, decoder: Decoder, name: str, antennas: DualAntenna, _config: Config) -> None:
+        self._decoder, self._name, self._antennas = decoder, name, antennas
+
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        time_us, fix_type, accuracy, yaw = fields
+        stamp = self._decoder.stamp(time_us) if self._antennas.stamp == "sensor" else ("", None)
+        return [self._decoder.event(self._name, stamp, t_receive_ns, self._payload(fix_type, accuracy, yaw))]
+
+    def _payload(self, fix_type: int, accuracy: int, yaw: int) -> GnssYaw | Invalid:
+        if yaw == 0:
+            return Invalid("no yaw given")
+        if yaw == UNKNOWN_U16:
+            return Invalid("no yaw at present")
+        if yaw > NORTH:
+            return Invalid("impossible yaw")
+        if fix_type < self._antennas.minimum_fix_type:
+            return Invalid("no fix")
+        return GnssYaw(math.radians(yaw / 100), math.radians(accuracy / 1e5) if accuracy else None)
+
+
 @dataclass(slots=True)
 class _Reading:
     clock: str
@@ -215,6 +246,7 @@ HANDLERS: dict[type[Sensor], Callable[[Decoder, str, Any, Config], Handler]] = {
     Gnss: GnssHandler,
     Wheel: WheelHandler,
     Barometer: PressureHandler,
+    DualAntenna: GnssYawHandler,
 }
 
 

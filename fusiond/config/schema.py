@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from fusiond.config.sensor import (
     vector_in_words,
 )
 from fusiond.config.toml import Name, Section
-from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Pressure, WheelSpeed
+from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Pressure, WheelSpeed
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -36,6 +37,7 @@ Encoding = Literal["json", "msgpack"]
 Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
 PressureMessage = Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"]
 Checksum = Literal["toyota", "honda", "hyundai", "tesla"]
+GnssMessage = Literal["GPS_RAW_INT", "GPS2_RAW"]
 ImuMessage = Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"]
 
 
@@ -163,7 +165,7 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     point: ClassVar[str] = "lever_arm_m"
 
     link: Name  # the [mavlink.LINK] it comes by
-    message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"  # the message that carries it
+    message: GnssMessage = "GPS_RAW_INT"  # the message that carries it
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the position was true
     velocity_delay_ms: Milliseconds = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
@@ -222,6 +224,47 @@ class Gnss(Sensor, frozen=True, kw_only=True):
             delay = delay_in_words(self.delay_ms + self.velocity_delay_ms)
             yield f"feeds {name}.velocity: sigma {self.velocity_sigma_mps:g} m/s, {delay}"
         yield f"antenna at {point_in_words(self.lever_arm_m)} from the IMU"
+
+
+class DualAntenna(Sensor, frozen=True, kw_only=True):
+    """[dual_antenna.NAME]: the yaw that a GNSS receiver with two antennas gives."""
+
+    label: ClassVar[str] = "GNSS yaw"
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: GnssMessage = "GPS_RAW_INT"  # the message whose field `yaw` carries it; a [gnss.NAME] may read it as well
+    offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0  # baseline from forward, clockwise; 0: autopilot corrects it
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the yaw was measured; it may differ from the position's
+    stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the message's stamp, use the receipt less delay_ms
+    sigma_deg: Positive = 0.5  # where the receiver gives none, and the smallest value taken from it
+    correlation_s: NotNegative = 1.0  # correlation time of its errors: multipath
+    noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_deg
+    noise_most: Positive = 3.0  # and up to this
+    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # lowest GPS_FIX_TYPE of a yaw that is used; 6: RTK fixed
+    interval_s: Positive = 0.2  # expected spacing of the messages
+
+    def streams(self) -> tuple[Stream, ...]:
+        return (
+            Stream(
+                "gnss_yaw",
+                GnssYaw,
+                self.delay_ms,
+                correlation_s=self.correlation_s,
+                sigma=math.radians(self.sigma_deg),
+                noise_min=self.noise_least,
+                noise_max=self.noise_most,
+            ),
+        )
+
+    def messages(self) -> dict[str, float]:
+        return {self.message: 1 / self.interval_s}
+
+    def origin(self) -> str:
+        return f"{self.message}.yaw of {self.link}"
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {STAMPS[self.stamp]}, {delay_in_words(self.delay_ms)}"
+        yield f"sigma {self.sigma_deg:g} deg, baseline {self.offset_deg:g} deg clockwise from forward"
 
 
 class Barometer(Sensor, frozen=True, kw_only=True):
@@ -519,6 +562,7 @@ class Config(Section, frozen=True, kw_only=True):
     gnss: dict[Name, Gnss] = field(default_factory=dict)
     wheel: dict[Name, Wheel] = field(default_factory=dict)
     barometer: dict[Name, Barometer] = field(default_factory=dict)
+    dual_antenna: dict[Name, DualAntenna] = field(default_factory=dict)
     directory: str = "."  # set on loading: where relative file names start
 
     def path(self, name: str) -> Path:

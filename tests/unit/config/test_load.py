@@ -161,6 +161,7 @@ SENSORS = {  # a table of each kind of sensor, its last line the input that it c
     "wheel.left": "message = 'm'\nsignal = 's'\nbus = 'chassis'",
     "wheel.right": "index = 2\nlink = 'autopilot'",
     "barometer.b": "link = 'autopilot'",
+    "dual_antenna.yaw": "link = 'autopilot'",
 }
 
 
@@ -194,6 +195,7 @@ def test_a_typing_error_in_the_link_of_an_output() -> None:
     ("first", "second", "origin"),
     [
         ("[gnss.a]\nlink = 'fc'", "[gnss.b]\nlink = 'fc'\nstamp = 'arrival'", "GPS_RAW_INT of fc"),
+        ("[dual_antenna.a]\nlink = 'fc'", "[dual_antenna.b]\nlink = 'fc'\noffset_deg = 90", "GPS_RAW_INT.yaw of fc"),
         ("[wheel.a]\nlink = 'fc'\nindex = 1", "[wheel.b]\nlink = 'fc'\nindex = 1", "WHEEL_DISTANCE[1] of fc"),
         (
             "[wheel.a]\nbus = 'body'\nmessage = 'm'\nsignal = 's'",
@@ -212,6 +214,24 @@ def test_two_sensors_of_a_kind_cannot_read_the_same(tmp_path: Path, first: str, 
     for mine, other in (("'fc'", "'other'"), ("index = 1", "index = 2"), ("signal = 's'", "signal = 't'")):
         if mine in second:
             assert config.parse(text + second.replace(mine, other), file)
+
+
+def test_sensors_of_two_kinds_can_read_one_message() -> None:
+    both = config.parse(BASE + GNSS + "[dual_antenna.yaw0]\nlink = 'autopilot'\n")
+    assert both.sources() == ("gps0.position", "gps0.velocity", "imu0", "yaw0")
+
+
+@pytest.mark.parametrize("reader", ["gnss.gps1", "dual_antenna.yaw0"])
+def test_what_is_sent_to_the_autopilot_must_not_come_back_as_a_measurement(reader: str) -> None:
+    text = f"[{reader}]\nlink = 'autopilot'\nmessage = 'GPS2_RAW'\n[autopilot]\nlink = 'autopilot'\nmessage = 'gps_input'\n"
+    check(BASE + text, 7, "autopilot.gps_id", "send it back as GPS2_RAW", f"[{reader}] reads")
+    assert config.parse(BASE + text.replace("GPS2_RAW", "GPS_RAW_INT")).autopilot.gps_id == 1
+
+
+@pytest.mark.parametrize("sensor", ["gnss.gps0", "barometer.b", "dual_antenna.yaw0"])
+def test_bounds_of_the_learnt_noise_are_in_order(sensor: str) -> None:
+    text = f"[{sensor}]\nlink = 'autopilot'\nnoise_most = 2\nnoise_least = 2.5"
+    check(BASE + text, 7, f"{sensor}.noise_least", "must not exceed noise_most (2)")
 
 
 def test_no_imu() -> None:
