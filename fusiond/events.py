@@ -40,7 +40,7 @@ class GnssVelocity(Struct, frozen=True, gc=False):
 
 
 class GnssYaw(Struct, frozen=True, gc=False):
-    """Yaw of the baseline between the two antennas of a GNSS receiver. `sigma` is None where the receiver gives none."""
+    """Yaw of the baseline between the two antennas of a GNSS receiver. The sigma is None where it gives none."""
 
     yaw: float  # rad, of the baseline, clockwise from north
     sigma: float | None = None  # rad, one standard deviation

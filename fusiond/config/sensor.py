@@ -17,7 +17,7 @@ class Stream(NamedTuple):
 
     model: str  # the observation model that it feeds, or INERTIAL
     payload: type[Payload]
-    delay_ms: float  # how long before its stamp a sample was true; a bus's own delay is added to it
+    delay_ms: float  # how long before its stamp a sample was measured; the delay of its bus is added
     suffix: str = ""
     enabled: bool = True  # False: the configuration turns the stream off
     correlation_s: float = 0.0  # correlation time of its errors
@@ -49,7 +49,7 @@ class Sensor(Section, frozen=True, kw_only=True):
 
     def origin(self) -> str:
         """What it reads, in words. Two sensors of one kind must not read the same."""
-        raise NotImplementedError
+        return f"{', '.join(self.messages())} of {', '.join(self.inputs().values())}"
 
     def description(self, name: str) -> Iterator[str]:
         """What it will do, in words; the first line follows the label and the name."""

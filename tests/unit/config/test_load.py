@@ -195,7 +195,7 @@ def test_a_typing_error_in_the_link_of_an_output() -> None:
     ("first", "second", "origin"),
     [
         ("[gnss.a]\nlink = 'fc'", "[gnss.b]\nlink = 'fc'\nstamp = 'arrival'", "GPS_RAW_INT of fc"),
-        ("[dual_antenna.a]\nlink = 'fc'", "[dual_antenna.b]\nlink = 'fc'\noffset_deg = 90", "GPS_RAW_INT.yaw of fc"),
+        ("[dual_antenna.a]\nlink = 'fc'", "[dual_antenna.b]\nlink = 'fc'\noffset_deg = 90", "GPS_RAW_INT of fc"),
         ("[wheel.a]\nlink = 'fc'\nindex = 1", "[wheel.b]\nlink = 'fc'\nindex = 1", "WHEEL_DISTANCE[1] of fc"),
         (
             "[wheel.a]\nbus = 'body'\nmessage = 'm'\nsignal = 's'",
