@@ -99,7 +99,7 @@ class Received(Struct, frozen=True, gc=False):
 
 
 class Measurement(Struct, frozen=True, gc=False):
-    """A payload placed on the time line: it tells of the instant `t_ns`. The order of events is `key`."""
+    """A payload placed on the time line: it was measured at `t_ns`. The order of events is `key`."""
 
     t_ns: int
     source: str

@@ -55,7 +55,7 @@ class CanDecoder:
     """The sensors of one [can.NAME] bus.
 
     `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
-    `counts` tells what became of the frames, `warnings` what is odd about the configuration. Raises ConfigError where the
+    `counts` says what became of the frames, `warnings` what is odd about the configuration. Raises ConfigError where the
     DBC files cannot be read or lack something.
     """
 

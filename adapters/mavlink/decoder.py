@@ -41,14 +41,14 @@ SIGNED = 0x01  # the one incompatibility flag that is defined
 HEADER_1, HEADER_2, CHECKSUM, SIGNATURE = 6, 10, 2, 13  # bytes
 SENDER_1 = Struct("<BBBB")  # at 2: counter, system, component, message id
 SENDER_2 = Struct("<BBBHB")  # at 4: the same, the id in two parts
-LENGTH_KNOWN = 3  # bytes of a frame that tell its length
+LENGTH_KNOWN = 3  # bytes of a frame that give its length
 LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 
 HEARTBEAT = "HEARTBEAT"
 SYSTEM_TIME = "SYSTEM_TIME"
 TIMESYNC = "TIMESYNC"
 NO_SENSORS = (HEARTBEAT, SYSTEM_TIME, TIMESYNC)
-TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: a question of fusiond's is stamped in whole microseconds and so much
+TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: fusiond's questions are stamped in whole microseconds plus the mark
 TYPE_GROUND_STATION = 6  # MAV_TYPE_GCS
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 
@@ -153,8 +153,8 @@ class FrameSplitter:
         return frames
 
     def _judge(self, at: int, length: int) -> bool | None:
-        """Is this complete frame one? A message of unknown checksum is believed when it stands between frames; None
-        says that this takes the next byte, which is not here yet."""
+        """Is this complete frame one? A message of unknown checksum is accepted when it stands between frames; None
+        where that takes the next byte, which is not here yet."""
         end = at + length
         sound = self._dialect.sound(bytes(self._buffer[at:end]))
         if sound is not None:
@@ -222,13 +222,13 @@ class MavlinkDecoder:
     """The sources of one [mavlink.NAME] link.
 
     `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
-    `counts` tells what became of the frames. Raises ConfigError where the dialect lacks a wanted message.
+    `counts` says what became of the frames. Raises ConfigError where the dialect lacks a wanted message.
     """
 
     def __init__(self, config: Config, link: str, sequences: dict[str, int] | None = None) -> None:
         settings = config.mavlink[link]
         self.link = link
-        self.system = settings.system  # whose frames are taken; 0: nobody's yet
+        self.system = settings.system  # the system whose frames are taken; 0: none yet
         self.settled = settings.system != 0  # configured, or an autopilot has been heard
         try:
             self.dialect = Dialect(settings.dialect)
@@ -317,7 +317,7 @@ class MavlinkDecoder:
         return []
 
     def _take_timesync(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
-        """The autopilot's answer to a question of ours, told by its mark; all it needs to be read is in the frame."""
+        """The autopilot's answer to fusiond's question, recognised by its mark; all that is needed is in the frame."""
         remote_ns, asked_ns = fields
         if remote_ns <= 0 or self._sender != self._autopilot or asked_ns % TIMESYNC_STEP != TIMESYNC_MARK:
             return []

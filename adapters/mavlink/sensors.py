@@ -28,7 +28,7 @@ UNKNOWN_U16 = 65535
 NORTH = 36000  # centidegrees: a yaw of 0
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 SHORTEST_NS = 2_000_000  # a message that repeats the one before sooner than this is a copy of it
-LONGEST_NS = SECOND  # the mean speed over a longer interval tells little of the speed at its middle
+LONGEST_NS = SECOND  # the mean speed over a longer interval says little about the speed at its middle
 RESET_M = 1.0  # a counter that falls to exactly 0 from farther off has been reset
 PASCAL = 100.0  # in a hectopascal
 FREEZING = 273.15  # K
@@ -172,7 +172,7 @@ class _Reading:
 class WheelHandler:
     """One [wheel.NAME] of WHEEL_DISTANCE: the mean speed between two messages, stamped at the middle between them.
 
-    An encoder's stamp may be that of its last pulse (ArduPilot), and so stand still with the wheel: then receipts tell how
+    An encoder's stamp may be that of its last pulse (ArduPilot), and so stand still with the wheel: then receipts say how
     much time has passed. The first message, and one that repeats the one before at once, give no event.
     """
 

@@ -377,9 +377,9 @@ class Wheel(Sensor, frozen=True, kw_only=True):
             (self.checksum, "checksum must be right"),
             (self.direction_signal, f"= {self.reverse_value} means backwards"),
         )
-        told = ", ".join(f"{signal} {rule}" for signal, rule in guards if signal)
-        if told:
-            yield told
+        guarded = ", ".join(f"{signal} {rule}" for signal, rule in guards if signal)
+        if guarded:
+            yield guarded
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         if (self.bus is None) == (self.link is None):

@@ -44,7 +44,7 @@ class Sensor(Section, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def messages(self) -> dict[str, float]:
-        """The messages of its link or bus that it reads, each with the rate [Hz] to ask for; 0 where nobody can be asked."""
+        """The messages of its link or bus that it reads, each with the rate [Hz] to ask for; 0 on a bus."""
         raise NotImplementedError
 
     def origin(self) -> str:
