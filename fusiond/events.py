@@ -39,6 +39,13 @@ class GnssVelocity(Struct, frozen=True, gc=False):
     sigma: float | None = None  # m/s, one standard deviation per axis
 
 
+class GnssYaw(Struct, frozen=True, gc=False):
+    """Yaw of the baseline between the two antennas of a GNSS receiver. The sigma is None where it gives none."""
+
+    yaw: float  # rad, of the baseline, clockwise from north
+    sigma: float | None = None  # rad, one standard deviation
+
+
 class WheelSpeed(Struct, frozen=True, gc=False):
     """Speed of one wheel's circumference along its rolling direction, positive forward."""
 
@@ -70,7 +77,7 @@ class Invalid(Struct, frozen=True, gc=False):
     reason: str
 
 
-Payload = ImuSample | GnssPosition | GnssVelocity | WheelSpeed | Pressure
+Payload = ImuSample | GnssPosition | GnssVelocity | GnssYaw | WheelSpeed | Pressure
 AnyPayload = Payload | ClockPair | Invalid
 
 
@@ -92,7 +99,7 @@ class Received(Struct, frozen=True, gc=False):
 
 
 class Measurement(Struct, frozen=True, gc=False):
-    """A payload placed on the time line: it tells of the instant `t_ns`. The order of events is `key`."""
+    """A payload placed on the time line: it was measured at `t_ns`. The order of events is `key`."""
 
     t_ns: int
     source: str

@@ -1,7 +1,7 @@
-"""CAN in: `Received` wheel speeds out of data frames, by DBC files. No I/O after construction.
+"""CAN in: `Received` events out of data frames, by DBC files. No I/O after construction.
 
 Which signal is which wheel, in which unit, and which signals vouch for it, is configuration. A frame is decoded once
-for all the wheels in it, and of its signals only those in use; frames that carry none are passed over by their id.
+for all the sensors in it, and of its signals only those in use; frames that carry none are passed over by their id.
 
 J1939 messages (by the bus's key `j1939`, or by the DBC's VFrameFormat) are known by their PGN, whatever
 the priority and the sender. Of their speeds, raw values whose top byte is above 0xFA mean an error or "not available".
@@ -14,12 +14,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import cantools
 from cantools.database.can import Database, Message, Signal
 
-from fusiond.config.schema import Config, Wheel
+from fusiond.config.schema import Checksum, Config, Wheel
+from fusiond.config.sensor import Sensor
 from fusiond.config.toml import ConfigError
 from fusiond.events import AnyPayload, Invalid, Received, WheelSpeed
 from fusiond_adapters.can.checksums import is_right
@@ -51,10 +52,10 @@ def parameter_group(arbitration_id: int) -> int:
 
 
 class CanDecoder:
-    """The wheels of one [can.NAME] bus.
+    """The sensors of one [can.NAME] bus.
 
     `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
-    `counts` tells what became of the frames, `warnings` what is odd about the configuration. Raises ConfigError where the
+    `counts` says what became of the frames, `warnings` what is odd about the configuration. Raises ConfigError where the
     DBC files cannot be read or lack something.
     """
 
@@ -65,32 +66,34 @@ class CanDecoder:
         self._groups: dict[int, _Frame] = {}  # J1939, by PGN
         self.warnings: list[str] = []
         self.counts = dict.fromkeys(("decoded", "other ids", "undecodable"), 0)
-        wheels = {name: wheel for name, wheel in config.wheel.items() if wheel.bus == bus}
-        if not wheels:
+        sensors = list(config.sensors(bus=bus))
+        if not sensors:
             return
         messages = _load([config.path(name) for name in config.can[bus].dbc], f"can.{bus}.dbc")
-        for name, wheel in wheels.items():
-            message = _find(wheel.message or "", messages, f"wheel.{name}.message", "message")
-            j1939 = message.is_extended_frame and (config.can[bus].j1939 or message.protocol == "j1939")
-            frames, key = self._frames, frame_key(message.frame_id, message.is_extended_frame)
-            if j1939:
-                frames, key = self._groups, parameter_group(message.frame_id)
-            alike = [*frames[key].readers] if key in frames else []
-            frames[key] = _Frame(message, [*alike, _WheelReader(name, wheel, message, j1939)])
-            self.warnings += frames[key].readers[-1].warnings
+        for table, name, section in sensors:
+            for wanted in section.messages():
+                message = _find(wanted, messages, f"{table}.{name}.message", "message")
+                j1939 = message.is_extended_frame and (config.can[bus].j1939 or message.protocol == "j1939")
+                frames, key = self._frames, frame_key(message.frame_id, message.is_extended_frame)
+                if j1939:
+                    frames, key = self._groups, parameter_group(message.frame_id)
+                others = frames[key].readers if key in frames else ()
+                reader = READERS[type(section)](name, section, message, j1939)
+                frames[key] = _Frame(message, [*others, reader])
+                self.warnings += reader.warnings
 
     @property
     def keys(self) -> frozenset[int]:
-        """The `frame_key` of every frame that carries a wheel, but for those of J1939."""
+        """The `frame_key` of every frame that carries a sensor, but for those of J1939."""
         return frozenset(self._frames)
 
     @property
     def groups(self) -> frozenset[int]:
-        """The PGN of every J1939 frame that carries a wheel."""
+        """The PGN of every J1939 frame that carries a sensor."""
         return frozenset(self._groups)
 
     def decode(self, arbitration_id: int, is_extended: bool, data: bytes, t_receive_ns: int) -> list[Received]:
-        """The wheels in one data frame; none where its id is of no use."""
+        """The events of one data frame; none where its id is of no use."""
         frame = self._frames.get(frame_key(arbitration_id, is_extended))
         if frame is None and self._groups and is_extended:
             frame = self._groups.get(parameter_group(arbitration_id))
@@ -119,10 +122,25 @@ class CanDecoder:
         return Received(source, sequence, "", None, t_receive_ns, payload)
 
 
-class _Frame:
-    """One frame with wheels in it, and how the signals in use are cut out of its data."""
+class Reader(Protocol):
+    """What makes the events of one sensor of decoded signals."""
 
-    def __init__(self, message: Message, readers: Sequence[_WheelReader]) -> None:
+    name: str
+    checksum: Checksum | None  # whose checksum the frame ends with
+    needed: list[str]  # signals
+    warnings: list[str]  # what is odd about its configuration
+
+    def read(self, signals: Mapping[str, float], short: bool) -> AnyPayload | None:
+        """None where the frame, multiplexed, carries other signals this time."""
+
+    def judge(self, signals: Mapping[str, float]) -> AnyPayload:
+        """The same, where none of the needed signals is missing."""
+
+
+class _Frame:
+    """One frame with sensors in it, and how the signals in use are cut out of its data."""
+
+    def __init__(self, message: Message, readers: Sequence[Reader]) -> None:
         self.readers = readers
         self.checksums = sorted({reader.checksum for reader in readers if reader.checksum is not None})
         self.size = message.length
@@ -227,6 +245,9 @@ class _WheelReader:
         if wheel.direction_signal is not None and signals[wheel.direction_signal] == wheel.reverse_value:
             speed = -speed
         return WheelSpeed(speed)
+
+
+READERS: dict[type[Sensor], Callable[[str, Any, Message, bool], Reader]] = {Wheel: _WheelReader}
 
 
 def _limits(speeds: list[Signal], given: int | None, j1939: bool) -> Iterator[tuple[str, int, float]]:

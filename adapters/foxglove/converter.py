@@ -15,6 +15,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from fusiond.config.schema import Config
+from fusiond.config.sensor import INERTIAL
 from fusiond.messages.local_frame import ENU_FLU, LocalFrame
 from fusiond.messages.types import (
     MESSAGES,
@@ -153,7 +154,7 @@ def innovations_topic(source: str) -> str:
 
 def judged(config: Config) -> list[str]:
     """The sources that have innovations: all but the IMU."""
-    return [source for source in config.sources() if source not in config.imu]
+    return [name for name, source in sorted(config.streams().items()) if source.stream.model != INERTIAL]
 
 
 def channels(config: Config) -> list[Channel]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from struct import Struct, calcsize
 from typing import Any
@@ -33,17 +33,7 @@ from fusiond.events import (
     Received,
     boot_clock,
 )
-from fusiond_adapters.mavlink.sensors import (
-    GNSS_FIELDS,
-    PRESSURE_FIELDS,
-    WHEEL_DISTANCE,
-    WHEEL_FIELDS,
-    GnssHandler,
-    ImuHandler,
-    PressureHandler,
-    WheelHandler,
-    imu_fields,
-)
+from fusiond_adapters.mavlink.sensors import HANDLERS
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 MAGIC = re.compile(b"[\xfd\xfe]")
@@ -51,14 +41,14 @@ SIGNED = 0x01  # the one incompatibility flag that is defined
 HEADER_1, HEADER_2, CHECKSUM, SIGNATURE = 6, 10, 2, 13  # bytes
 SENDER_1 = Struct("<BBBB")  # at 2: counter, system, component, message id
 SENDER_2 = Struct("<BBBHB")  # at 4: the same, the id in two parts
-LENGTH_KNOWN = 3  # bytes of a frame that tell its length
+LENGTH_KNOWN = 3  # bytes of a frame that give its length
 LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 
 HEARTBEAT = "HEARTBEAT"
 SYSTEM_TIME = "SYSTEM_TIME"
 TIMESYNC = "TIMESYNC"
 NO_SENSORS = (HEARTBEAT, SYSTEM_TIME, TIMESYNC)
-TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: a question of fusiond's is stamped in whole microseconds and so much
+TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: fusiond's questions are stamped in whole microseconds plus the mark
 TYPE_GROUND_STATION = 6  # MAV_TYPE_GCS
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 
@@ -68,6 +58,8 @@ CLOCK_SET_US = 1_262_304_000 * 10**6  # 2010: an autopilot that says less has no
 LONGEST_GAP = 128  # a longer jump of the frame counter is a repeat or a reordering, not a loss
 
 Bytes = bytes | bytearray
+Pick = Callable[[tuple[Any, ...]], tuple[Any, ...]]
+Take = Callable[[tuple[Any, ...], int], list[Received]]  # fields, receive stamp [ns]
 
 
 def frame_length(buffer: Bytes, at: int = 0) -> int:
@@ -161,8 +153,8 @@ class FrameSplitter:
         return frames
 
     def _judge(self, at: int, length: int) -> bool | None:
-        """Is this complete frame one? A message of unknown checksum is believed when it stands between frames; None
-        says that this takes the next byte, which is not here yet."""
+        """Is this complete frame one? A message of unknown checksum is accepted when it stands between frames; None
+        where that takes the next byte, which is not here yet."""
         end = at + length
         sound = self._dialect.sound(bytes(self._buffer[at:end]))
         if sound is not None:
@@ -173,20 +165,21 @@ class FrameSplitter:
 
 
 class _Reader:
-    """One wanted message: its layout, and the functions that make events of its fields. Only the fields asked for are
-    unpacked; one that is an array gives as many values."""
+    """One wanted message: its layout, and what makes events of its fields. Only the fields that any of the `takers` asks
+    for are unpacked, and each taker gets its own; a field that is an array gives as many values."""
 
-    def __init__(self, kind: Any, fields: tuple[str, ...]) -> None:
+    def __init__(self, kind: Any, takers: list[tuple[tuple[str, ...], Take]]) -> None:
+        fields = tuple(dict.fromkeys(field for wanted, _ in takers for field in wanted))
         layout = _layout(kind, fields)
         self._unpack: Callable[[bytes], tuple[Any, ...]] = layout.unpack
         self._size = layout.size
-        self._pick = _order(kind, fields)
+        self._pick = _pick(kind, [name for name in kind.ordered_fieldnames if name in fields], fields)
         self.seed = _seed(kind)
         self.is_sensor = kind.msgname not in NO_SENSORS
-        self.handlers: list[Callable[[tuple[Any, ...], int], list[Received]]] = []
+        self.takers = [_picking(take, _pick(kind, fields, wanted)) for wanted, take in takers]
 
     def fields(self, frame: bytes) -> tuple[Any, ...]:
-        """The fields asked for, of a frame whose checksum is right."""
+        """All the fields asked for, of a frame whose checksum is right."""
         start, size = HEADER_2 if frame[0] == MAGIC_2 else HEADER_1, self._size
         present = frame[1]
         payload = frame[start : start + (present if present < size else size)]
@@ -207,30 +200,35 @@ def _layout(kind: Any, fields: tuple[str, ...]) -> Struct:
     return Struct("<" + "".join(parts))
 
 
-def _order(kind: Any, fields: tuple[str, ...]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]] | None:
-    """What puts the values of `_layout` into the order of `fields`; None where they have it."""
+def _pick(kind: Any, given: Sequence[str], wanted: Sequence[str]) -> Pick | None:
+    """What picks the values of the fields `wanted` out of those of the fields `given`; None where they are the same."""
     places: dict[str, list[int]] = {}
-    count = 0
-    for name, code in _codes(kind).items():
-        if name in fields:
-            values = 1 if code.endswith("s") else int(code[:-1] or 1)
-            places[name] = list(range(count, count + values))
-            count += values
-    order = [place for name in fields for place in places[name]]
-    return None if order == list(range(count)) else itemgetter(*order)
+    codes, count = _codes(kind), 0
+    for name in given:
+        values = 1 if codes[name].endswith("s") else int(codes[name][:-1] or 1)
+        places[name] = list(range(count, count + values))
+        count += values
+    order = [place for name in wanted for place in places[name]]
+    if order == list(range(count)):
+        return None
+    return itemgetter(*order) if len(order) > 1 else lambda values: (values[order[0]],)
+
+
+def _picking(take: Take, pick: Pick | None) -> Take:
+    return take if pick is None else lambda fields, t_receive_ns: take(pick(fields), t_receive_ns)
 
 
 class MavlinkDecoder:
     """The sources of one [mavlink.NAME] link.
 
     `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
-    `counts` tells what became of the frames. Raises ConfigError where the dialect lacks a wanted message.
+    `counts` says what became of the frames. Raises ConfigError where the dialect lacks a wanted message.
     """
 
     def __init__(self, config: Config, link: str, sequences: dict[str, int] | None = None) -> None:
         settings = config.mavlink[link]
         self.link = link
-        self.system = settings.system  # whose frames are taken; 0: nobody's yet
+        self.system = settings.system  # the system whose frames are taken; 0: none yet
         self.settled = settings.system != 0  # configured, or an autopilot has been heard
         try:
             self.dialect = Dialect(settings.dialect)
@@ -281,9 +279,9 @@ class MavlinkDecoder:
         self.counts["decoded"] += 1
         self._sender = component
         fields = reader.fields(frame)
-        if len(reader.handlers) == 1:
-            return reader.handlers[0](fields, t_receive_ns)
-        return [event for handle in reader.handlers for event in handle(fields, t_receive_ns)]
+        if len(reader.takers) == 1:
+            return reader.takers[0](fields, t_receive_ns)
+        return [event for take in reader.takers for event in take(fields, t_receive_ns)]
 
     def _adopt(self, system: int, reader: _Reader, frame: bytes) -> bool:
         """Does this frame of a system not followed so far make it the one to follow?"""
@@ -300,46 +298,33 @@ class MavlinkDecoder:
         return True
 
     def _make_readers(self, config: Config) -> dict[int, _Reader]:
-        readers: dict[int, _Reader] = {}
-
-        def reader(message: str, fields: tuple[str, ...]) -> _Reader:
-            kind = self.dialect.type_of(message)
-            return readers.setdefault(self.dialect.ids[message], _Reader(kind, fields))
-
-        self._heartbeat = reader(HEARTBEAT, ("type", "autopilot"))
-        self._heartbeat.handlers.append(self._take_heartbeat)
+        takers: dict[str, list[tuple[tuple[str, ...], Take]]] = {HEARTBEAT: [(("type", "autopilot"), self._take_heartbeat)]}
         if SYSTEM_TIME in self.dialect.ids:
-            reader(SYSTEM_TIME, ("time_unix_usec", "time_boot_ms")).handlers.append(self._take_system_time)
+            takers[SYSTEM_TIME] = [(("time_unix_usec", "time_boot_ms"), self._take_system_time)]
         if TIMESYNC in self.dialect.ids:
-            reader(TIMESYNC, ("tc1", "ts1")).handlers.append(self._take_timesync)
-        for name, imu in config.imu.items():
-            if imu.link == self.link:
-                reader(imu.message, imu_fields(imu.message)).handlers.append(ImuHandler(self, name, imu).take)
-        for name, gnss in config.gnss.items():
-            if gnss.link == self.link:
-                reader(gnss.message, GNSS_FIELDS).handlers.append(GnssHandler(self, name, gnss).take)
-        for name, wheel in config.wheel.items():
-            if wheel.link == self.link:
-                reader(WHEEL_DISTANCE, WHEEL_FIELDS).handlers.append(WheelHandler(self, name, wheel, config).take)
-        for name, barometer in config.barometer.items():
-            if barometer.link == self.link:
-                reader(barometer.message, PRESSURE_FIELDS).handlers.append(PressureHandler(self, name, barometer).take)
-        return readers
+            takers[TIMESYNC] = [(("tc1", "ts1"), self._take_timesync)]
+        for _, name, section in config.sensors(link=self.link):
+            handler = HANDLERS[type(section)](self, name, section, config)
+            for message in section.messages():
+                takers.setdefault(message, []).append((handler.fields, handler.take))
+        readers = {message: _Reader(self.dialect.type_of(message), found) for message, found in takers.items()}
+        self._heartbeat = readers[HEARTBEAT]
+        return {self.dialect.ids[message]: reader for message, reader in readers.items()}
 
-    def _take_heartbeat(self, fields: tuple[int, int], _t_receive_ns: int) -> list[Received]:
+    def _take_heartbeat(self, fields: tuple[Any, ...], _t_receive_ns: int) -> list[Received]:
         if _is_autopilot(fields):
             self.settled, self._autopilot = True, self._autopilot or self._sender
         return []
 
-    def _take_timesync(self, fields: tuple[int, int], t_receive_ns: int) -> list[Received]:
-        """The autopilot's answer to a question of ours, told by its mark; all it needs to be read is in the frame."""
+    def _take_timesync(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        """The autopilot's answer to fusiond's question, recognised by its mark; all that is needed is in the frame."""
         remote_ns, asked_ns = fields
         if remote_ns <= 0 or self._sender != self._autopilot or asked_ns % TIMESYNC_STEP != TIMESYNC_MARK:
             return []
         stamp = (self._boot_clock, remote_ns)
         return [self.event(f"{self.link}.timesync", stamp, t_receive_ns, ClockPair(HOST_CLOCK, asked_ns))]
 
-    def _take_system_time(self, fields: tuple[int, int], t_receive_ns: int) -> list[Received]:
+    def _take_system_time(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         unix_us, boot_ms = fields
         if not CLOCK_SET_US <= unix_us < UNIX_UNTIL_US:
             return []

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import common
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.estimator.solution import Mode
+from fusiond.events import GnssPosition, GnssVelocity, Payload, Pressure, WheelSpeed
 from fusiond.messages.types import EventMessage, HealthMessage, Message, Severity, State, StateMessage
 from fusiond.ports.inputs import LiveInput
 from fusiond.ports.outputs import Outbox, OutputLost
@@ -302,11 +303,12 @@ class GroundStation:
 def ratios(health: HealthMessage, config: Config) -> Ratios:
     """The greatest test ratios of the sources that are present, in sigmas over the gate's."""
 
-    def greatest(names: list[str]) -> float:
+    streams = config.streams()
+
+    def greatest(*payloads: type[Payload]) -> float:
+        names = [name for name, source in streams.items() if source.stream.payload in payloads]
         known = [health.sources[name] for name in names if name in health.sources]
         found = [source.test_ratio for source in known if source.present and source.test_ratio is not None]
         return math.sqrt(max(found)) if found else math.nan
 
-    position = [f"{name}.position" for name in config.gnss]
-    velocity = [f"{name}.velocity" for name in config.gnss] + list(config.wheel)
-    return Ratios(greatest(velocity), greatest(position), greatest([*position, *config.barometer]))
+    return Ratios(greatest(GnssVelocity, WheelSpeed), greatest(GnssPosition), greatest(GnssPosition, Pressure))

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from fusiond.config.schema import Barometer, Config, Gnss, Imu, Wheel
+from fusiond.config.schema import Barometer, Config, DualAntenna, Gnss, Imu, Wheel
+from fusiond.config.sensor import Sensor
 from fusiond.events import (
     AnyPayload,
     GnssPosition,
     GnssVelocity,
+    GnssYaw,
     ImuSample,
     Invalid,
     Pressure,
@@ -22,25 +25,19 @@ from fusiond.events import (
 SECOND = 1_000_000_000  # ns
 MILLI_G = 9.80665e-3  # m/s^2
 UNKNOWN_U16 = 65535
+NORTH = 36000  # centidegrees: a yaw of 0
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 SHORTEST_NS = 2_000_000  # a message that repeats the one before sooner than this is a copy of it
-LONGEST_NS = SECOND  # the mean speed over a longer interval tells little of the speed at its middle
+LONGEST_NS = SECOND  # the mean speed over a longer interval says little about the speed at its middle
 RESET_M = 1.0  # a counter that falls to exactly 0 from farther off has been reset
 PASCAL = 100.0  # in a hectopascal
 FREEZING = 273.15  # K
 COLDEST, HOTTEST = 180.0, 400.0  # K, of a sensor that works
-LEAST_PRESSURE, MOST_PRESSURE = 1_000.0, 120_000.0  # Pa: 31 km up, below the Dead Sea
+MIN_PRESSURE, MAX_PRESSURE = 1_000.0, 120_000.0  # Pa: 31 km up, below the Dead Sea
 
 _AXES = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro")
 _IMU_STAMP = {"HIGHRES_IMU": "time_usec", "RAW_IMU": "time_usec"}
 _IMU_EXTRA = {"HIGHRES_IMU": ("fields_updated", "id")}
-GNSS_FIELDS = (
-    "time_usec", "fix_type", "lat", "lon", "alt", "vel", "cog",
-    "alt_ellipsoid", "h_acc", "v_acc", "vel_acc",  # extensions
-)  # fmt: skip
-WHEEL_DISTANCE = "WHEEL_DISTANCE"
-WHEEL_FIELDS = ("time_usec", "count", "distance")
-PRESSURE_FIELDS = ("time_boot_ms", "press_abs", "temperature")
 
 Stamp = tuple[str, int | None]  # clock, stamp [ns]
 
@@ -54,16 +51,20 @@ class Decoder(Protocol):
     def stamp(self, time_us: int) -> Stamp: ...
 
 
-def imu_fields(message: str) -> tuple[str, ...]:
-    """What `ImuHandler` takes of a message."""
-    return (_IMU_STAMP.get(message, "time_boot_ms"), *_AXES, *_IMU_EXTRA.get(message, ()))
+class Handler(Protocol):
+    """What makes events of the messages of one sensor: `take` gets the `fields` in this order, and the receive stamp."""
+
+    @property
+    def fields(self) -> tuple[str, ...]: ...
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]: ...
 
 
 class ImuHandler:
     """One [imu.NAME]: fields to ImuSample."""
 
-    def __init__(self, decoder: Decoder, name: str, imu: Imu) -> None:
+    def __init__(self, decoder: Decoder, name: str, imu: Imu, _config: Config) -> None:
         self._decoder, self._name, self._imu = decoder, name, imu
+        self.fields = (_IMU_STAMP.get(imu.message, "time_boot_ms"), *_AXES, *_IMU_EXTRA.get(imu.message, ()))
         self._mat_bs = _rotation(imu.rotation_deg) if any(imu.rotation_deg) else None  # sensor axes to body
         self._si = imu.message == "HIGHRES_IMU"
         self._limits = imu.accel_limit, imu.gyro_limit
@@ -97,11 +98,16 @@ class ImuHandler:
 class GnssHandler:
     """One [gnss.NAME]: fields to GnssPosition and GnssVelocity."""
 
-    def __init__(self, decoder: Decoder, name: str, gnss: Gnss) -> None:
+    fields = (
+        "time_usec", "fix_type", "lat", "lon", "alt", "vel", "cog",
+        "alt_ellipsoid", "h_acc", "v_acc", "vel_acc",  # extensions
+    )  # fmt: skip
+
+    def __init__(self, decoder: Decoder, name: str, gnss: Gnss, _config: Config) -> None:
         self._decoder, self._gnss = decoder, gnss
         self._position, self._velocity = f"{name}.position", f"{name}.velocity"
 
-    def take(self, fields: tuple[int, ...], t_receive_ns: int) -> list[Received]:
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         time_us, fix_type, lat, lon, alt, vel, cog, alt_ellipsoid, h_acc, v_acc, vel_acc = fields
         position: AnyPayload
         velocity: AnyPayload
@@ -125,6 +131,35 @@ class GnssHandler:
         return events
 
 
+class GnssYawHandler:
+    """One [dual_antenna.NAME]: fields to GnssYaw.
+
+    By MAVLink 0 says that the receiver gives no yaw; PX4 sends it where there is none for the moment, too. It is counted
+    as invalid, so that a receiver that is not set up for yaw shows in the health.
+    """
+
+    fields = ("time_usec", "fix_type", "hdg_acc", "yaw")
+
+    def __init__(self, decoder: Decoder, name: str, antennas: DualAntenna, _config: Config) -> None:
+        self._decoder, self._name, self._antennas = decoder, name, antennas
+
+    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        time_us, fix_type, accuracy, yaw = fields
+        stamp = self._decoder.stamp(time_us) if self._antennas.stamp == "sensor" else ("", None)
+        return [self._decoder.event(self._name, stamp, t_receive_ns, self._payload(fix_type, accuracy, yaw))]
+
+    def _payload(self, fix_type: int, accuracy: int, yaw: int) -> GnssYaw | Invalid:
+        if yaw == 0:
+            return Invalid("no yaw given")
+        if yaw == UNKNOWN_U16:
+            return Invalid("no yaw at present")
+        if yaw > NORTH:
+            return Invalid("impossible yaw")
+        if fix_type < self._antennas.minimum_fix_type:
+            return Invalid("no fix")
+        return GnssYaw(math.radians(yaw / 100), math.radians(accuracy / 1e5) if accuracy else None)
+
+
 @dataclass(slots=True)
 class _Reading:
     clock: str
@@ -137,9 +172,11 @@ class _Reading:
 class WheelHandler:
     """One [wheel.NAME] of WHEEL_DISTANCE: the mean speed between two messages, stamped at the middle between them.
 
-    An encoder's stamp may be that of its last pulse (ArduPilot), and so stand still with the wheel: then receipts tell how
+    An encoder's stamp may be that of its last pulse (ArduPilot), and so stand still with the wheel: then receipts say how
     much time has passed. The first message, and one that repeats the one before at once, give no event.
     """
+
+    fields = ("time_usec", "count", "distance")
 
     def __init__(self, decoder: Decoder, name: str, wheel: Wheel, config: Config) -> None:
         self._decoder, self._name, self._wheel = decoder, name, wheel
@@ -188,18 +225,29 @@ class WheelHandler:
 class PressureHandler:
     """One [barometer.NAME]: fields to Pressure."""
 
-    def __init__(self, decoder: Decoder, name: str, _barometer: Barometer) -> None:
+    fields = ("time_boot_ms", "press_abs", "temperature")
+
+    def __init__(self, decoder: Decoder, name: str, _barometer: Barometer, _config: Config) -> None:
         self._decoder, self._name = decoder, name
 
     def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         boot_ms, hectopascal, centi_celsius = fields
         absolute, temperature = hectopascal * PASCAL, centi_celsius / 100 + FREEZING
         payload: AnyPayload = Pressure(absolute, temperature)
-        if not LEAST_PRESSURE <= absolute <= MOST_PRESSURE:
+        if not MIN_PRESSURE <= absolute <= MAX_PRESSURE:
             payload = Invalid("impossible pressure" if math.isfinite(absolute) else "not finite")
         elif not COLDEST <= temperature <= HOTTEST:
             payload = Invalid("impossible temperature")
         return [self._decoder.event(self._name, self._decoder.stamp(boot_ms * 1000), t_receive_ns, payload)]
+
+
+HANDLERS: dict[type[Sensor], Callable[[Decoder, str, Any, Config], Handler]] = {
+    Imu: ImuHandler,
+    Gnss: GnssHandler,
+    Wheel: WheelHandler,
+    Barometer: PressureHandler,
+    DualAntenna: GnssYawHandler,
+}
 
 
 def _known(thousandths: int) -> float | None:

@@ -26,7 +26,6 @@ from fusiond_adapters.mavlink.decoder import (
     Dialect,
     message_id,
 )
-from fusiond_adapters.mavlink.sensors import WHEEL_DISTANCE
 from fusiond_adapters.mavlink.signing import Signing
 
 SECOND = 1_000_000_000  # ns
@@ -37,7 +36,7 @@ LONGEST_PATIENCE_NS = 60 * SECOND  # between two requests for a message that doe
 REBOOT_MS = 1000  # a boot time that falls by more is a reboot; less is a frame that was overtaken
 SYSTEM_TIME_HZ = 1.0
 STATUS_HZ = 1.0
-STATUS_OF = {"ardupilot": "EKF_STATUS_REPORT", "px4": "ESTIMATOR_STATUS"}  # who tells of its estimator in which message
+STATUS_OF = {"ardupilot": "EKF_STATUS_REPORT", "px4": "ESTIMATOR_STATUS"}  # reports on its estimator
 STATUS_IDS = {"EKF_STATUS_REPORT": 193, "ESTIMATOR_STATUS": 230}  # the first is not in the dialect `common`
 TIMESYNC_NS = SECOND  # between two questions
 TIMESYNC_FIRST, TIMESYNC_FIRST_NS = 20, SECOND // 10  # so many, so close, at the start and after a reboot
@@ -54,7 +53,7 @@ class Wanted:
     patience_ns: int = WINDOW_NS  # from a request to the next one
     ask_at_ns: int = 0
     refused: str | None = None  # MAV_RESULT of the last answer, where it was no yes
-    told: bool | None = None  # what the news last said: is it good?
+    reported: bool | None = None  # the state of `good` in the last news
 
     @property
     def good(self) -> bool:
@@ -62,10 +61,10 @@ class Wanted:
 
     def news(self) -> str | None:
         """How it comes, in words, once that has changed."""
-        if self.told == self.good or (self.told is None and self.good):
-            self.told = self.good
+        if self.reported == self.good or (self.reported is None and self.good):
+            self.reported = self.good
             return None
-        self.told = self.good
+        self.reported = self.good
         refused = f", refused: {self.refused}" if self.refused and not self.good else ""
         return f"comes at {self.measured_hz or 0:.3g} Hz, wanted at {self.rate_hz:.3g} Hz{refused}"
 
@@ -79,7 +78,7 @@ class MavlinkTalk:
         self._ids = {**STATUS_IDS, **dialect.ids}
         self.target: tuple[int, int] | None = None  # system, component of the autopilot
         self.reboots = 0
-        self.news: list[str] = []  # what has changed, for people; whoever tells it clears it
+        self.news: list[str] = []  # what has changed, in words; who reports it clears it
         self.wanted = _wanted(config, link, dialect) if settings.request else {}
         self._by_id = {self._ids[name]: wanted for name, wanted in self.wanted.items()}
         self._asks_time = settings.timesync
@@ -211,11 +210,8 @@ class MavlinkTalk:
 
 
 def _wanted(config: Config, link: str, dialect: Dialect) -> dict[str, Wanted]:
-    """The messages that the configuration takes from a link, with the greatest rate that anyone wants."""
-    rates: list[tuple[str, float]] = [(imu.message, imu.rate_hz) for imu in config.imu.values() if imu.link == link]
-    rates += [(gnss.message, 1 / gnss.interval_s) for gnss in config.gnss.values() if gnss.link == link]
-    rates += [(WHEEL_DISTANCE, wheel.rate_hz) for wheel in config.wheel.values() if wheel.link == link]
-    rates += [(barometer.message, barometer.rate_hz) for barometer in config.barometer.values() if barometer.link == link]
+    """The messages that the configuration takes from a link, each at the highest rate that a sensor wants."""
+    rates = [wanted for _, _, section in config.sensors(link=link) for wanted in section.messages().items()]
     if rates and SYSTEM_TIME in dialect.ids:
         rates.append((SYSTEM_TIME, SYSTEM_TIME_HZ))
     if config.autopilot.link == link:

@@ -7,31 +7,29 @@ from typing import NamedTuple
 
 import msgspec
 
-from fusiond.config.schema import Config
+from fusiond.config.schema import Config, sensor_tables
 from fusiond.config.toml import Section
 
 LIVE_MAVLINK = frozenset({"connection", "baud", "own_system", "own_component", "request", "timesync"})
 LIVE_CAN = frozenset({"interface", "channel", "config_context", "fd", "bitrate"})
-LIVE_IMU = frozenset({"rate_hz"})
 LIVE_LIVE = frozenset({"reopen_max_s"})
 LIVE_RECORD = frozenset({"folder", "file_mb", "total_mb"})
 LIVE_STATE = frozenset({"every_s"})
-LIVE = {"mavlink": LIVE_MAVLINK, "can": LIVE_CAN, "imu": LIVE_IMU, "live": LIVE_LIVE, "record": LIVE_RECORD,
-    "state": LIVE_STATE,
-}
+LIVE = {"mavlink": LIVE_MAVLINK, "can": LIVE_CAN, "live": LIVE_LIVE, "record": LIVE_RECORD, "state": LIVE_STATE}
 
 
 class Changes(NamedTuple):
     """Dotted keys that differ between two configurations."""
 
     taken: tuple[str, ...]
-    refused: tuple[str, ...]  # the estimate, or the way it is published, hangs on them: they need a restart
+    refused: tuple[str, ...]  # they need a restart: the estimate, or how it is published, depends on them
 
 
 def changes(old: Config, new: Config) -> Changes:
     """How two configurations differ. With anything refused, nothing is to be taken."""
     found = list(_differences(old, new))
-    refused = tuple(".".join(key) for key in found if key[-1] not in LIVE.get(key[0], ()))
+    live = LIVE | {table: kind.live for table, kind in sensor_tables().items()}
+    refused = tuple(".".join(key) for key in found if key[-1] not in live.get(key[0], ()))
     return Changes(tuple(".".join(key) for key in found) if not refused else (), refused)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator
 from pathlib import Path
 
-from fusiond.config.schema import MOST_SCALES, Can, Config, Mavlink, calibrated, wheel_groups
+from fusiond.config.schema import MAX_SCALES, Config, calibrated, sensor_tables, wheel_groups
+from fusiond.config.sensor import INPUTS
 from fusiond.config.toml import decode, read_text, refuse
 
 
@@ -22,68 +24,57 @@ def parse(text: str, path: Path = Path("config.toml")) -> Config:
     return config
 
 
-def _contradictions(config: Config) -> list[tuple[str, str]]:
+def _contradictions(config: Config) -> Iterator[tuple[str, str]]:
     """What the types cannot say: references between tables, and combinations that make no sense."""
-    found: list[tuple[str, str]] = []
-
-    def refer(kind: str, name: str, key: str, target: str, known: dict[str, Mavlink] | dict[str, Can]) -> None:
-        if target not in known:
-            table = "mavlink" if key == "link" else "can"
-            have = ", ".join(sorted(known)) or "none"
-            found.append((f"{kind}.{name}.{key}", f"there is no [{table}.{target}]; configured: {have}"))
-
-    for name, imu in config.imu.items():
-        refer("imu", name, "link", imu.link, config.mavlink)
-    for name, gnss in config.gnss.items():
-        refer("gnss", name, "link", gnss.link, config.mavlink)
-    found += _contradictions_on_wheels(config)
-    for name, wheel in config.wheel.items():
-        if wheel.bus is not None:
-            refer("wheel", name, "bus", wheel.bus, config.can)
-        if wheel.link is not None:
-            refer("wheel", name, "link", wheel.link, config.mavlink)
-    for name, barometer in config.barometer.items():
-        refer("barometer", name, "link", barometer.link, config.mavlink)
-    found += _contradictions_on_can(config)
-    found += _contradictions_on_ros2(config)
-    found += _contradictions_on_mavlink_out(config)
-    found += _contradictions_on_signing(config)
-    if len(config.imu) != 1:
-        key = ".".join(["imu", *list(config.imu)[1:2]])
-        found.append((key, f"exactly one [imu.NAME] is needed, found {len(config.imu)}"))
-    taken: dict[str, str] = {}
-    tables = (("imu", config.imu), ("gnss", config.gnss), ("wheel", config.wheel), ("barometer", config.barometer))
-    for table, named in tables:
-        for name in named:
-            if name in taken:
-                found.append((f"{table}.{name}", f"[{taken[name]}.{name}] has this name; each source needs its own"))
-            taken.setdefault(name, table)
-    found += _contradictions_of_learning(config)
+    yield from _contradictions_on_counts(config)
+    yield from _contradictions_on_sensors(config)
+    yield from _contradictions_on_can(config)
+    yield from _contradictions_on_ros2(config)
+    yield from _contradictions_on_mavlink_out(config)
+    yield from _contradictions_on_signing(config)
+    yield from _contradictions_on_learning(config)
     if config.record.file_mb * 2 > config.record.total_mb:
-        found.append(("record.total_mb", f"must be at least twice file_mb ({config.record.file_mb:g} MB)"))
+        yield "record.total_mb", f"must be at least twice file_mb ({config.record.file_mb:g} MB)"
     if config.filter.imu_gap_s >= config.filter.horizon_s:
-        found.append(("filter.imu_gap_s", f"must be below horizon_s ({config.filter.horizon_s} s)"))
-    return found
+        yield "filter.imu_gap_s", f"must be below horizon_s ({config.filter.horizon_s} s)"
 
 
-CAN_KEYS = ("message", "signal")
-GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
+def _contradictions_on_sensors(config: Config) -> Iterator[tuple[str, str]]:
+    names: dict[str, str] = {}  # of the sensors so far: their tables
+    origins: dict[tuple[str, str], str] = {}  # of a table, what is read there, and by whom
+    for table, name, section in config.sensors():
+        for key, complaint in section.contradictions():
+            yield ".".join(filter(None, (table, name, key))), complaint
+        for key, target in section.inputs().items():
+            yield from _reference(config, f"{table}.{name}.{key}", INPUTS[key], target)
+        for stream in section.streams():
+            if stream.noise_min > stream.noise_max:
+                yield f"{table}.{name}.noise_least", f"must not exceed noise_most ({stream.noise_max:g})"
+        if name in names:
+            yield f"{table}.{name}", f"[{names[name]}.{name}] has this name; each sensor needs its own"
+        names[name] = table
+        first = origins.setdefault((table, section.origin()), name)
+        if first != name:
+            yield f"{table}.{name}", f"reads the same as [{table}.{first}]: {section.origin()}"
 
 
-def _contradictions_on_wheels(config: Config) -> Iterator[tuple[str, str]]:
-    """A wheel comes either by CAN or by MAVLink."""
-    for name, wheel in config.wheel.items():
-        if (wheel.bus is None) == (wheel.link is None):
-            yield f"wheel.{name}", "one of 'bus' (CAN) and 'link' (MAVLink's WHEEL_DISTANCE) is needed, and not both"
-        wanted, others = (CAN_KEYS, ("index",)) if wheel.link is None else (("index",), CAN_KEYS + GUARD_KEYS)
-        for key in wanted:
-            if getattr(wheel, key) is None:
-                yield f"wheel.{name}", f"the key '{key}' is missing"
-        for key in others:
-            if getattr(wheel, key) is not None:
-                yield f"wheel.{name}.{key}", f"has no meaning for a wheel that comes by {'link' if wheel.link else 'bus'}"
-        if wheel.link is None and wheel.quantum_m:
-            yield f"wheel.{name}.quantum_m", "is for wheels that come by link; use quantum_mps"
+def _reference(config: Config, key: str, table: str, name: str) -> Iterator[tuple[str, str]]:
+    """A complaint where a key names a table that is not there."""
+    known = getattr(config, table)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        meant = f" (did you mean '{near[0]}'?)" if near else ""
+        yield key, f"there is no [{table}.{name}]{meant}; configured: {', '.join(sorted(known)) or 'none'}"
+
+
+def _contradictions_on_counts(config: Config) -> Iterator[tuple[str, str]]:
+    """How many sensors of a kind there may be."""
+    for table, kind in sensor_tables().items():
+        names = list(getattr(config, table))
+        if kind.required and len(names) != 1:
+            yield ".".join([table, *names[1:2]]), f"exactly one [{table}.NAME] is needed, found {len(names)}"
+        elif kind.only_one is not None and len(names) > 1:
+            yield f"{table}.{names[1]}", f"{kind.only_one}, that of [{table}.{names[0]}]"
 
 
 def _contradictions_on_signing(config: Config) -> Iterator[tuple[str, str]]:
@@ -105,49 +96,39 @@ def _contradictions_on_ros2(config: Config) -> Iterator[tuple[str, str]]:
         yield "ros2.connect", f"{own[0]} is where [zenoh] listens, and no router: give one of them another port"
 
 
-def _contradictions_of_learning(config: Config) -> Iterator[tuple[str, str]]:
-    for table, named in (("gnss", config.gnss), ("wheel", config.wheel), ("barometer", config.barometer)):
-        for name, source in named.items():
-            if source.noise_least > source.noise_most:
-                yield f"{table}.{name}.noise_least", f"must not exceed noise_most ({source.noise_most:g})"
+def _contradictions_on_learning(config: Config) -> Iterator[tuple[str, str]]:
     learnt = [name for name, gnss in config.gnss.items() if calibrated(gnss)]
     if len(learnt) > 1:
         yield f"gnss.{learnt[1]}", f"the lever arm and delays of one receiver can be learnt: [gnss.{learnt[0]}]"
-    for name in list(config.barometer)[1:]:
-        yield f"barometer.{name}", f"there is one height offset to learn, that of [barometer.{next(iter(config.barometer))}]"
-    if len(set(wheel_groups(config).values())) > MOST_SCALES:
-        yield "filter.wheel_scale_by", f"at most {MOST_SCALES} scales, '{config.filter.wheel_scale_by}' makes more"
+    if len(set(wheel_groups(config).values())) > MAX_SCALES:
+        yield "filter.wheel_scale_by", f"at most {MAX_SCALES} scales, '{config.filter.wheel_scale_by}' makes more"
 
 
 def _contradictions_on_can(config: Config) -> Iterator[tuple[str, str]]:
-    for name, wheel in config.wheel.items():
-        if wheel.unit in ("rad/s", "rpm") and wheel.radius_m is None:
-            yield f"wheel.{name}.unit", f"{wheel.unit} needs radius_m"
-        if wheel.scale == 0:
-            yield f"wheel.{name}.scale", "must not be 0"
     for name, can in config.can.items():
         for dbc in can.dbc:
             if not config.path(dbc).is_file():
                 yield f"can.{name}.dbc", f"no such file: {config.path(dbc)}"
-        if not can.dbc and any(wheel.bus == name for wheel in config.wheel.values()):
-            yield f"can.{name}", 'its wheels need a DBC file: dbc = ["FILE.dbc"]'
+        if not can.dbc and any(config.sensors(bus=name)):
+            yield f"can.{name}", 'its sensors need a DBC file: dbc = ["FILE.dbc"]'
 
 
 def _contradictions_on_mavlink_out(config: Config) -> Iterator[tuple[str, str]]:
     autopilot, station = config.autopilot, config.ground_station
-    have = ", ".join(sorted(config.mavlink)) or "none"
     for table, link in (("autopilot", autopilot.link), ("ground_station", station.link)):
-        if link is not None and link not in config.mavlink:
-            yield f"{table}.link", f"there is no [mavlink.{link}]; configured: {have}"
+        if link is not None:
+            yield from _reference(config, f"{table}.link", "mavlink", link)
     if autopilot.link is not None and autopilot.rate_hz > config.publish.rate_hz:
         yield "autopilot.rate_hz", f"must be at most publish.rate_hz ({config.publish.rate_hz:g} Hz)"
     if autopilot.kind == "px4" and autopilot.message == "gps_input":
         yield "autopilot.message", "PX4 takes no GPS_INPUT; use odometry or vision_position"
     echo = ("GPS_RAW_INT", "GPS2_RAW")[autopilot.gps_id]
-    heard = any(gnss.link == autopilot.link and gnss.message == echo for gnss in config.gnss.values())
-    if heard and autopilot.message == "gps_input":
-        yield "autopilot.gps_id", f"the autopilot would send it back as {echo}, which a [gnss.NAME] takes for a receiver's"
+    if autopilot.link is not None and autopilot.message == "gps_input":
+        for sensor in config.sensors(link=autopilot.link):
+            if echo in sensor.section.messages():
+                reader = f"[{sensor.table}.{sensor.name}]"
+                yield "autopilot.gps_id", f"the autopilot would send it back as {echo}, which {reader} reads"
     if autopilot.set_origin and autopilot.message == "gps_input":
-        yield "autopilot.set_origin", "gps_input tells where it is; it has no local origin"
+        yield "autopilot.set_origin", "gps_input has no local origin: it gives latitude and longitude"
     if station.link is not None and station.connection is not None:
         yield "ground_station.connection", "give link or connection, not both"

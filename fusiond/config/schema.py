@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from msgspec import Meta, field
 
-from fusiond.config.sensor import INERTIAL, Sensor, Stream
+from fusiond.config.sensor import (
+    INERTIAL,
+    Sensor,
+    Stream,
+    delay_in_words,
+    point_in_words,
+    vector_in_words,
+)
 from fusiond.config.toml import Name, Section
-from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Pressure, WheelSpeed
+from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Pressure, WheelSpeed
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -20,11 +28,16 @@ Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
 Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 Vector = tuple[float, float, float]
 MILLISECOND = 1_000_000  # ns
+WHEEL_DISTANCE = "WHEEL_DISTANCE"  # the MAVLink message of all wheels
+CAN_KEYS = ("message", "signal")  # of a wheel that comes by CAN
+GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
+STAMPS = {"sensor": "by its own stamp", "arrival": "by its arrival"}
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 Encoding = Literal["json", "msgpack"]
 Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
 PressureMessage = Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"]
 Checksum = Literal["toyota", "honda", "hyundai", "tesla"]
+GnssMessage = Literal["GPS_RAW_INT", "GPS2_RAW"]
 ImuMessage = Literal["HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU"]
 
 
@@ -32,31 +45,31 @@ class Vehicle(Section, frozen=True, kw_only=True):
     """[vehicle]"""
 
     name: Name = "vehicle"  # names the vehicle in every published key
-    geoid_m: float = 0.0  # geoid above the ellipsoid here, taken off heights for MAVLink, which counts from the sea
+    geoid_m: float = 0.0  # height of the geoid above the ellipsoid; subtracted where MAVLink wants heights above the sea
 
 
 class Filter(Section, frozen=True, kw_only=True):
-    """[filter]: the estimator, its memory and how it starts."""
+    """[filter]: the estimator, its history and how it starts."""
 
-    horizon_s: Seconds = 1.0  # how late a measurement may be and still be put where it belongs
+    horizon_s: Seconds = 1.0  # how late a measurement may be and still be fused at its own time
     snapshot_interval_s: Span = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
-    imu_gap_s: Seconds = 0.2  # an IMU silent for longer is bridged by coasting
-    restart_gap_s: Seconds = 30.0  # after a hole in the data of this length the filter aligns anew
+    imu_gap_s: Seconds = 0.2  # an IMU that is silent for longer is bridged by coasting
+    restart_gap_s: Seconds = 30.0  # after a gap of this length in the data the filter aligns again
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
-    gnss_reset_s: Seconds = 30.0  # GNSS that was rejected for this long, off alike all the time, is believed again
-    gnss_return_s: Seconds = 3.0  # the same where no fix was fused for 10 s before
-    v_max_mps: Positive = 60.0  # largest speed of the vehicle: first velocity sigma is a third of it
+    gnss_reset_s: Seconds = 30.0  # GNSS rejected for this long with a consistent offset is trusted again
+    gnss_return_s: Seconds = 3.0  # likewise, where no fix was fused in the 10 s before
+    v_max_mps: Positive = 60.0  # top speed of the vehicle: the initial velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # heading at the first start, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
-    heading_spread_deg: Annotated[float, Meta(gt=0, le=30)] = 8.0  # headings this close together are chosen between no more
-    course_speed_mps: Positive = 8.0  # above this GNSS speed, at which it never reverses, its course is the start heading
+    heading_spread_deg: Annotated[float, Meta(gt=0, le=30)] = 8.0  # the choice of a heading ends below this spread
+    course_speed_mps: Positive = 8.0  # above this GNSS speed the vehicle never reverses: its course starts the heading
     level_sigma_deg: Positive = 3.0  # sigma of roll and pitch after leveling on the accelerometer
-    position_timeout_s: Seconds = 2.0  # without a position fix for this long: dead reckoning
-    lost_sigma_m: Positive = 200.0  # horizontal position sigma beyond which the state is called lost
-    wheel_scale_sigma: NotNegative = 0.01  # first sigma of a wheel scale (1 = 100 %); 0 freezes it at zero
+    position_timeout_s: Seconds = 2.0  # without a position fix for this long the mode is dead reckoning
+    lost_sigma_m: Positive = 200.0  # horizontal position sigma above which the mode is lost
+    wheel_scale_sigma: NotNegative = 0.01  # initial sigma of a wheel scale (1 = 100 %); 0: not estimated
     wheel_scale_by: Literal["vehicle", "axle", "wheel"] = "vehicle"  # one scale for all wheels, or for each axle or wheel
     wheel_scale_walk: NotNegative = 1e-5  # its random walk [1/sqrt(s)]
-    mount_sigma_deg: NotNegative = 1.0  # first sigma of the IMU's pitch and yaw against the vehicle; 0 freezes them
+    mount_sigma_deg: NotNegative = 1.0  # initial sigma of the IMU's pitch and yaw against the vehicle; 0: not estimated
     mount_walk_deg: NotNegative = 1e-3  # its random walk [deg/sqrt(s)]
 
 
@@ -64,16 +77,16 @@ class Motion(Section, frozen=True, kw_only=True):
     """[motion]: what a wheeled vehicle cannot do, used as measurements."""
 
     non_holonomic: bool = True  # no sideways or vertical speed at the point below
-    point_m: Vector = (0.0, 0.0, 0.0)  # where it holds, from the IMU: the middle of the unsteered axle
-    lateral_sigma_mps: Positive = 0.2  # how far the point may slip sideways: sigma of that constraint
-    vertical_sigma_mps: Positive = 0.3  # likewise up and down: suspension
+    point_m: Vector = (0.0, 0.0, 0.0)  # where that is so, from the IMU: the middle of the unsteered axle
+    lateral_sigma_mps: Positive = 0.2  # sigma of the sideways speed: slip
+    vertical_sigma_mps: Positive = 0.3  # sigma of the vertical speed: suspension
     interval_s: Seconds = 0.1  # spacing of constraint, zero velocity and zero rotation updates
-    minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint rests below this speed
+    minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint is not used below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
-    still_wheel_mps: Positive = 0.1  # every wheel at or below this; so fast it may creep unseen
-    still_gyro_deg_s: Positive = 0.6  # and the gyro's scatter below this
-    still_accel_mps2: Positive = 0.25  # and the accelerometer's scatter below this
-    still_after_s: Seconds = 0.5  # for this long
+    still_wheel_mps: Positive = 0.1  # every wheel at or below this speed, at which it may creep unseen
+    still_gyro_deg_s: Positive = 0.6  # standard deviation of the gyro below this
+    still_accel_mps2: Positive = 0.25  # standard deviation of the accelerometer below this
+    still_after_s: Seconds = 0.5  # all of it for this long
     zero_velocity_sigma_mps: Positive = 0.02  # sigma of the velocity at standstill, per axis
     zero_rotation_sigma_deg_s: Positive = 0.1  # sigma of the angular rate at standstill, per axis
 
@@ -84,15 +97,15 @@ class Mavlink(Section, frozen=True, kw_only=True):
     connection: str = "udpin:127.0.0.1:14550"  # pymavlink connection string
     baud: Annotated[int, Meta(gt=0)] = 115200  # for serial devices
     dialect: Name = "common"  # pymavlink dialect, "common" or "ardupilotmega"
-    system: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this system id; 0: the first autopilot heard
-    component: Annotated[int, Meta(ge=0, le=255)] = 0  # take only this component id; 0: every one
+    system: Annotated[int, Meta(ge=0, le=255)] = 0  # accept only this system id; 0: the first autopilot heard
+    component: Annotated[int, Meta(ge=0, le=255)] = 0  # accept only this component id; 0: all
     own_system: Annotated[int, Meta(ge=0, le=255)] = 0  # fusiond's own system id, live; 0: that of the autopilot
     own_component: Annotated[int, Meta(ge=1, le=255)] = 191  # fusiond's own component id (191: onboard computer)
-    request: bool = True  # live: ask the autopilot for the messages needed, at the rates of [imu] and [gnss]
+    request: bool = True  # live: ask the autopilot for the messages needed, at the sensors' rates
     timesync: bool = True  # live: measure the autopilot's clock by TIMESYNC round trips
-    signing_key_file: str | None = None  # 32 bytes, or 64 hex digits: sign what is sent, take only what is signed so
+    signing_key_file: str | None = None  # 32 bytes or 64 hex digits: sign what is sent, accept only what is signed with it
     signing_timestamp_file: str | None = None  # where the last signing timestamp is kept over restarts
-    accept_unsigned: bool = False  # with a key: take unsigned frames as well; wrongly signed ones never
+    accept_unsigned: bool = False  # with a key: accept unsigned frames too; wrongly signed ones are never accepted
 
 
 class Can(Section, frozen=True, kw_only=True):
@@ -105,23 +118,26 @@ class Can(Section, frozen=True, kw_only=True):
     config_context: str | None = None  # section of python-can's own configuration file
     fd: bool = False  # CAN FD
     bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], where the interface does not set it
-    delay_ms: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0  # how old a frame is when it is received
+    delay_ms: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0  # age of a frame when it is received
     j1939: bool = False  # match 29-bit ids by PGN, of any priority and sender; always so where the DBC says J1939
 
 
 class Imu(Sensor, frozen=True, kw_only=True):
     """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
 
+    label: ClassVar[str] = "IMU"
+    required: ClassVar[bool] = True
+
     link: Name  # the [mavlink.LINK] it comes by
     message: ImuMessage = "HIGHRES_IMU"  # the message that carries it
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
     rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to ask the autopilot for, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
-    delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was true
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was measured
     accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
     gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
-    accel_bias_sigma: NotNegative = 0.3  # first sigma of the accelerometer bias [m/s^2]
-    gyro_bias_sigma: NotNegative = 0.01  # first sigma of the gyro bias [rad/s]
+    accel_bias_sigma: NotNegative = 0.3  # initial sigma of the accelerometer bias [m/s^2]
+    gyro_bias_sigma: NotNegative = 0.01  # initial sigma of the gyro bias [rad/s]
     accel_bias_walk: NotNegative = 1e-3  # accelerometer bias random walk [m/s^2/sqrt(s)]
     gyro_bias_walk: NotNegative = 2e-5  # gyro bias random walk [rad/s/sqrt(s)]
     accel_limit: Positive = 160.0  # a sample beyond this is invalid [m/s^2]
@@ -130,71 +146,141 @@ class Imu(Sensor, frozen=True, kw_only=True):
     def streams(self) -> tuple[Stream, ...]:
         return (Stream(INERTIAL, ImuSample, self.delay_ms),)
 
+    def messages(self) -> dict[str, float]:
+        return {self.message: self.rate_hz}
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {delay_in_words(self.delay_ms)}"
+        yield f"turned by {vector_in_words(self.rotation_deg)} deg (roll, pitch, yaw) against forward-right-down"
+        yield f"noise {self.accel_noise:g} m/s^2/sqrt(Hz), {self.gyro_noise:g} rad/s/sqrt(Hz)"
+
 
 class Gnss(Sensor, frozen=True, kw_only=True):
     """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
 
+    label: ClassVar[str] = "GNSS"
+    point: ClassVar[str] = "lever_arm_m"
+
     link: Name  # the [mavlink.LINK] it comes by
-    message: Literal["GPS_RAW_INT", "GPS2_RAW"] = "GPS_RAW_INT"  # the message that carries it
+    message: GnssMessage = "GPS_RAW_INT"  # the message that carries it
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
-    delay_ms: Milliseconds = 0.0  # how long before its stamp the position was true
-    velocity_delay_ms: Milliseconds = 0.0  # how much longer before its stamp the velocity was true (receivers smooth it)
-    lever_arm_sigma_m: NotNegative = 0.0  # first sigma of the lever arm, per axis, which is then learnt; 0 freezes it
-    delay_sigma_ms: NotNegative = 0.0  # likewise, delay
-    velocity_delay_sigma_ms: NotNegative = 0.0  # likewise, velocity delay
-    stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's own stamp, use the receipt less delay_ms
-    position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and the least it is believed to be
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the position was measured
+    velocity_delay_ms: Milliseconds = 0.0  # additional delay of the velocity (receivers smooth it)
+    lever_arm_sigma_m: NotNegative = 0.0  # initial sigma of the lever arm, per axis; 0: not estimated
+    delay_sigma_ms: NotNegative = 0.0  # likewise, of the delay
+    velocity_delay_sigma_ms: NotNegative = 0.0  # likewise, of the velocity delay
+    stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's stamp, use the receipt less delay_ms
+    position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and a lower bound to what it gives
     height_sigma_m: Positive = 3.0  # likewise, vertical
     velocity_sigma_mps: Positive = 0.2  # likewise, per axis
-    position_correlation_s: NotNegative = 0.0  # time over which position errors stay alike: weighs dense fixes down
+    position_correlation_s: NotNegative = 0.0  # correlation time of position errors: dense fixes weigh less
     velocity_correlation_s: NotNegative = 0.0  # likewise, velocity
     use_velocity: bool = True  # fuse speed and course as well
-    outliers: Literal["gate", "mixture"] = "gate"  # leave them out, or weigh each fix by how likely it is one
+    outliers: Literal["gate", "mixture"] = "gate"  # reject them, or weight each fix by its likelihood of being one
     outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, where outliers = "mixture"
     noise_least: Positive = 1.0  # the sigmas are learnt from the innovations, down to this multiple of the given ones
     noise_most: Positive = 3.0  # and up to this
     group: Name | None = None  # receivers of one group share part of their error: atmosphere, multipath
     shared_sigma_m: NotNegative = 0.0  # that part of the position's error
-    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # GPS_FIX_TYPE that a fix must have at least; 3: 3-D
+    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # lowest GPS_FIX_TYPE that is used; 3: 3-D
     interval_s: Positive = 0.2  # expected spacing of fixes
 
     def streams(self) -> tuple[Stream, ...]:
-        both = Stream("", GnssPosition, self.delay_ms, noise_min=self.noise_least, noise_max=self.noise_most,
-                      outlier_share=self.outlier_share if self.outliers == "mixture" else 0.0)  # fmt: skip
-        position = both._replace(
-            model="gnss_position",
+        outlier_share = self.outlier_share if self.outliers == "mixture" else 0.0
+        position = Stream(
+            "gnss_position",
+            GnssPosition,
+            self.delay_ms,
             suffix=".position",
             correlation_s=self.position_correlation_s,
             sigma=self.position_sigma_m,
             group=self.group,
             shared_sigma=self.shared_sigma_m,
+            noise_min=self.noise_least,
+            noise_max=self.noise_most,
+            outlier_share=outlier_share,
             companion=".velocity",
         )
-        velocity = both._replace(
-            model="gnss_velocity",
-            payload=GnssVelocity,
+        velocity = Stream(
+            "gnss_velocity",
+            GnssVelocity,
+            self.delay_ms + self.velocity_delay_ms,
             suffix=".velocity",
-            delay_ms=self.delay_ms + self.velocity_delay_ms,
             enabled=self.use_velocity,
             correlation_s=self.velocity_correlation_s,
             sigma=self.velocity_sigma_mps,
+            noise_min=self.noise_least,
+            noise_max=self.noise_most,
+            outlier_share=outlier_share,
         )
         return position, velocity
+
+    def messages(self) -> dict[str, float]:
+        return {self.message: 1 / self.interval_s}
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {STAMPS[self.stamp]}, {delay_in_words(self.delay_ms)}"
+        yield f"feeds {name}.position: sigma {self.position_sigma_m:g} m, in height {self.height_sigma_m:g} m"
+        if self.use_velocity:
+            delay = delay_in_words(self.delay_ms + self.velocity_delay_ms)
+            yield f"feeds {name}.velocity: sigma {self.velocity_sigma_mps:g} m/s, {delay}"
+        yield f"antenna at {point_in_words(self.lever_arm_m)} from the IMU"
+
+
+class DualAntenna(Sensor, frozen=True, kw_only=True):
+    """[dual_antenna.NAME]: the yaw that a GNSS receiver with two antennas gives."""
+
+    label: ClassVar[str] = "GNSS yaw"
+
+    link: Name  # the [mavlink.LINK] it comes by
+    message: GnssMessage = "GPS_RAW_INT"  # the message whose field `yaw` carries it; a [gnss.NAME] may read it as well
+    offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0  # baseline from forward, clockwise; 0: autopilot corrects it
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the yaw was measured; it may differ from the position's
+    stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the message's stamp, use the receipt less delay_ms
+    sigma_deg: Positive = 0.5  # where the receiver gives none, and the smallest value taken from it
+    correlation_s: NotNegative = 1.0  # correlation time of its errors: multipath
+    noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_deg
+    noise_most: Positive = 3.0  # and up to this
+    minimum_fix_type: Annotated[int, Meta(ge=2, le=8)] = 3  # lowest GPS_FIX_TYPE of a yaw that is used; 6: RTK fixed
+    interval_s: Positive = 0.2  # expected spacing of the messages
+
+    def streams(self) -> tuple[Stream, ...]:
+        return (
+            Stream(
+                "gnss_yaw",
+                GnssYaw,
+                self.delay_ms,
+                correlation_s=self.correlation_s,
+                sigma=math.radians(self.sigma_deg),
+                noise_min=self.noise_least,
+                noise_max=self.noise_most,
+            ),
+        )
+
+    def messages(self) -> dict[str, float]:
+        return {self.message: 1 / self.interval_s}
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {STAMPS[self.stamp]}, {delay_in_words(self.delay_ms)}"
+        yield f"sigma {self.sigma_deg:g} deg, baseline {self.offset_deg:g} deg clockwise from forward"
 
 
 class Barometer(Sensor, frozen=True, kw_only=True):
     """[barometer.NAME]: a static pressure sensor, taken as a height with an unknown offset. At most one."""
 
+    label: ClassVar[str] = "barometer"
+    only_one: ClassVar[str] = "there is one height offset to learn"
+
     link: Name  # the [mavlink.LINK] it comes by
     message: PressureMessage = "SCALED_PRESSURE"  # the message that carries it
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # readings a second to ask the autopilot for, live
-    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true
-    sigma_m: Positive = 1.0  # noise of one reading, as a height: wind, draught, and what speed does to static pressure
-    correlation_s: NotNegative = 1.0  # time over which its errors stay alike
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was measured
+    sigma_m: Positive = 1.0  # noise of one reading, as a height: wind, draught, effect of speed on static pressure
+    correlation_s: NotNegative = 1.0  # correlation time of its errors
     noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_m
     noise_most: Positive = 3.0  # and up to this
-    offset_sigma_m: Positive = 100.0  # first sigma of what it reads too much, which is learnt: weather and geoid
-    offset_walk_m: NotNegative = 0.1  # its random walk [m/sqrt(s)]: weather, and air that is not the standard's
+    offset_sigma_m: Positive = 100.0  # initial sigma of the height offset, which is estimated: weather and geoid
+    offset_walk_m: NotNegative = 0.1  # its random walk [m/sqrt(s)]: weather, and deviation from the standard atmosphere
 
     def streams(self) -> tuple[Stream, ...]:
         return (
@@ -209,10 +295,20 @@ class Barometer(Sensor, frozen=True, kw_only=True):
             ),
         )
 
+    def messages(self) -> dict[str, float]:
+        return {self.message: self.rate_hz}
+
+    def description(self, name: str) -> Iterator[str]:
+        yield f"{self.origin()}, {delay_in_words(self.delay_ms)}"
+        yield f"sigma {self.sigma_m:g} m about a height offset that is learnt"
+
 
 class Wheel(Sensor, frozen=True, kw_only=True):
-    """[wheel.NAME]: one wheel; each is a source of its own. By CAN (bus, message, signal) or by MAVLink's WHEEL_DISTANCE
-    (link, index)."""
+    """[wheel.NAME]: one wheel, a source of its own. It comes by CAN (bus, message, signal) or by MAVLink's
+    WHEEL_DISTANCE (link, index)."""
+
+    label: ClassVar[str] = "wheel"
+    point: ClassVar[str] = "position_m"
 
     bus: Name | None = None  # the [can.BUS] it comes by
     message: str | None = None  # message name in the DBC
@@ -224,26 +320,26 @@ class Wheel(Sensor, frozen=True, kw_only=True):
     unit: Unit = "km/h"  # of the decoded signal; rad/s and rpm need radius_m
     radius_m: Positive | None = None  # rolling radius
     scale: float = 1.0  # known factor on the signal; negative where it counts backwards
-    unsigned: bool = True  # the signal tells the amount only, not the direction
+    unsigned: bool = True  # the signal has no sign: it does not give the direction
     direction_signal: str | None = None  # a signal whose value reverse_value means driving backwards
     reverse_value: int = 1  # what direction_signal reads when driving backwards
     valid_signal: str | None = None  # a signal that must equal valid_value
     valid_value: int = 0  # what valid_signal must read
-    counter_signal: str | None = None  # a rolling counter; a repeated value marks a stale frame
-    checksum: Checksum | None = None  # whose checksum the frame ends with
-    not_available_from: int | None = None  # raw values of the signal from here on mean error or not available
+    counter_signal: str | None = None  # a rolling counter; a repeated value means a stale frame
+    checksum: Checksum | None = None  # the frame ends with the checksum of this maker
+    not_available_from: int | None = None  # raw values of the signal from here on mean "error" or "not available"
     base_signal: str | None = None  # a signal in the same unit that is added: J1939's axle speed under a relative one
     position_m: Vector = (0.0, 0.0, 0.0)  # the wheel's contact point from the IMU: forward, right, down
-    steered: bool = False  # it turns with the steering wheel, so it measures speed along its own track
+    steered: bool = False  # it is steered, so it measures speed along its own track
     sigma_mps: Positive = 0.1  # white noise of one reading
     noise_least: Positive = 1.0  # sigma is learnt from the innovations, down to this multiple of sigma_mps
     noise_most: Positive = 3.0  # and up to this
     group: Name | None = None  # wheels of one group share part of their error: tyres, one axle's slip
     shared_sigma_mps: NotNegative = 0.0  # that part of it
-    least_mps: NotNegative = 0.1  # slower than this it reads 0, or anything
+    least_mps: NotNegative = 0.1  # below this speed its reading is unreliable, or 0
     quantum_mps: NotNegative = 0.0  # step of the signal: adds quantum^2/12 to the variance
-    correlation_s: NotNegative = 0.0  # time over which its errors (slip, tyre) stay alike
-    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was true (the bus's delay_ms comes on top)
+    correlation_s: NotNegative = 0.0  # correlation time of its errors (slip, tyre)
+    delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was measured (the bus's delay_ms is added)
 
     def streams(self) -> tuple[Stream, ...]:
         return (
@@ -260,14 +356,56 @@ class Wheel(Sensor, frozen=True, kw_only=True):
             ),
         )
 
+    def messages(self) -> dict[str, float]:
+        return {WHEEL_DISTANCE: self.rate_hz} if self.message is None else {self.message: 0.0}
+
+    def origin(self) -> str:
+        if self.link is not None:
+            return f"{WHEEL_DISTANCE}[{self.index}] of {self.link}"
+        return f"{self.message}.{self.signal} of {self.bus}"
+
+    def description(self, name: str) -> Iterator[str]:
+        unit = f" in {self.unit}" if self.bus is not None else ""
+        yield f"{self.origin()}{unit}, {delay_in_words(self.delay_ms)}"
+        kind = "steered" if self.steered else "not steered"
+        sign = "amount only" if self.unsigned and not self.direction_signal else "with direction"
+        factor = f", times {self.scale:g}" if self.scale != 1 else ""
+        yield f"at {point_in_words(self.position_m)}, {kind}, {sign}{factor}, sigma {self.sigma_mps:g} m/s"
+        guards = (
+            (self.valid_signal, f"must be {self.valid_value}"),
+            (self.counter_signal, "must change"),
+            (self.checksum, "checksum must be right"),
+            (self.direction_signal, f"= {self.reverse_value} means backwards"),
+        )
+        guarded = ", ".join(f"{signal} {rule}" for signal, rule in guards if signal)
+        if guarded:
+            yield guarded
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        if (self.bus is None) == (self.link is None):
+            yield "", "one of 'bus' (CAN) and 'link' (MAVLink's WHEEL_DISTANCE) is needed, and not both"
+        needed, others = (CAN_KEYS, ("index",)) if self.link is None else (("index",), CAN_KEYS + GUARD_KEYS)
+        for key in needed:
+            if getattr(self, key) is None:
+                yield "", f"the key '{key}' is missing"
+        for key in others:
+            if getattr(self, key) is not None:
+                yield key, f"has no meaning for a wheel that comes by {'link' if self.link else 'bus'}"
+        if self.link is None and self.quantum_m:
+            yield "quantum_m", "is for wheels that come by link; use quantum_mps"
+        if self.unit in ("rad/s", "rpm") and self.radius_m is None:
+            yield "unit", f"{self.unit} needs radius_m"
+        if self.scale == 0:
+            yield "scale", "must not be 0"
+
 
 class Publish(Section, frozen=True, kw_only=True):
     """[publish]"""
 
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
-    on_imu: bool = False  # each waits up to half a period for the next IMU sample, and is of its receipt
+    on_imu: bool = False  # each publication waits up to half a period for the next IMU sample
     settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # of the state at the horizon, at most; 0: none
-    innovations: bool = True  # tell of every measurement how it was judged
+    innovations: bool = True  # publish the innovation and outcome of every measurement
     encoding: Encoding = "json"  # "json" or "msgpack"
 
 
@@ -284,7 +422,7 @@ class Zenoh(Section, frozen=True, kw_only=True):
 class Live(Section, frozen=True, kw_only=True):
     """[live]: how `fusiond run` treats its inputs."""
 
-    queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 1024  # of each input; when full it is thinned
+    queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 1024  # capacity of each input's queue; when full it is thinned
     reopen_max_s: Annotated[float, Meta(gt=0, le=600)] = 5.0  # longest pause before a lost input is opened again
 
 
@@ -292,15 +430,15 @@ class Record(Section, frozen=True, kw_only=True):
     """[record]: the black box of `fusiond run`: what was received, as .tlog and candump .log."""
 
     folder: str | None = None  # such as "/var/lib/fusiond/box"; none: nothing is recorded
-    file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # a file that has grown to this is followed by another
-    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
+    file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # size at which a new file is begun
+    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # beyond this the oldest files are deleted
 
 
 class State(Section, frozen=True, kw_only=True):
     """[state]: the state that `fusiond run` keeps on disk, for a hot start."""
 
     file: str | None = None  # such as "/var/lib/fusiond/state.json"; none: every start is a cold one
-    every_s: Annotated[float, Meta(ge=1, le=86400)] = 10.0  # it is written this often, and at the end
+    every_s: Annotated[float, Meta(ge=1, le=86400)] = 10.0  # interval between writes; it is also written at the end
     max_age_s: Annotated[float, Meta(gt=0, le=1e9)] = 604800.0  # one older than this is ignored; default: a week
 
 
@@ -309,8 +447,8 @@ class Mcap(Section, frozen=True, kw_only=True):
 
     folder: str | None = None  # such as "/var/lib/fusiond/mcap"; none: nothing is written
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # states a second, at most; none: every one
-    file_mb: Annotated[float, Meta(ge=0.5, le=100_000)] = 64.0  # a file that has grown to about this is followed by another
-    total_mb: Annotated[float, Meta(ge=1, le=10_000_000)] = 1024.0  # the oldest files go when all exceed this together
+    file_mb: Annotated[float, Meta(ge=0.5, le=100_000)] = 64.0  # size, about, at which a new file is begun
+    total_mb: Annotated[float, Meta(ge=1, le=10_000_000)] = 1024.0  # beyond this the oldest files are deleted
 
 
 class Foxglove(Section, frozen=True, kw_only=True):
@@ -332,9 +470,9 @@ class Ros2(Section, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # states a second, at most
     map_frame: Frame = "map"  # east-north-up at the origin; the pose in it jumps when the filter corrects itself
     odom_frame: Frame = "odom"  # the pose in it drifts, but never jumps
-    base_frame: Frame = "base_link"  # the IMU's place, with axes forward-left-up
+    base_frame: Frame = "base_link"  # at the IMU, with axes forward-left-up
     origin: Vector | None = None  # of the map frame: latitude, longitude [deg], height; none: the first position
-    tf: bool = True  # tell tf2 of map, odom and base_link; false where another node does
+    tf: bool = True  # publish the transforms of map, odom and base_link; false where another node does
     type_hashes: bool = True  # as in ROS 2 Iron and later; false for Humble, which has none
     mode: Literal["client", "peer"] = "client"  # a client needs a router (rmw_zenohd), a peer does not
     connect: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # Zenoh endpoints to connect to
@@ -354,7 +492,7 @@ class Autopilot(Section, frozen=True, kw_only=True):
     """[autopilot]: the state sent back to the autopilot as a source of its own estimator, live; off without a link."""
 
     link: Name | None = None  # the [mavlink.LINK] of the autopilot; none: nothing is sent
-    kind: Literal["ardupilot", "px4"] = "ardupilot"  # whose rules the messages follow
+    kind: Literal["ardupilot", "px4"] = "ardupilot"  # the autopilot whose rules the messages follow
     message: Literal["odometry", "gps_input", "vision_position"] = "odometry"  # PX4 takes no gps_input
     rate_hz: Annotated[float, Meta(ge=4, le=200)] = 30.0  # messages a second; at most publish.rate_hz
     dead_reckoning: bool = True  # send while dead reckoning too, within the limits below
@@ -362,14 +500,14 @@ class Autopilot(Section, frozen=True, kw_only=True):
     velocity_sigma_mps: Positive = 1.0  # nor beyond this velocity sigma
     yaw_sigma_deg: Positive = 15.0  # nor beyond this yaw sigma
     age_ms: Positive = 500.0  # nor when the last IMU sample is older
-    set_origin: bool = False  # tell the autopilot where the local origin is, as long as it has none of its own
-    gps_id: Annotated[int, Meta(ge=0, le=1)] = 1  # which receiver gps_input stands for: 0 is the first, 1 the second
+    set_origin: bool = False  # send the local origin to the autopilot, as long as it has none of its own
+    gps_id: Annotated[int, Meta(ge=0, le=1)] = 1  # the receiver that gps_input stands for: 0 is the first, 1 the second
 
 
 class GroundStation(Section, frozen=True, kw_only=True):
     """[ground_station]: telemetry, events and answers for a ground station, live; off without link and connection."""
 
-    link: Name | None = None  # send over this [mavlink.LINK], to be routed by the autopilot
+    link: Name | None = None  # send over this [mavlink.LINK]; the autopilot routes it
     connection: str | None = None  # or over a connection of its own, such as "udpout:192.168.1.10:14550"
     baud: Annotated[int, Meta(gt=0)] = 115200  # of that connection, for serial devices
     system: Annotated[int, Meta(ge=0, le=255)] = 0  # own system id on that connection; 0: that of the autopilot
@@ -419,6 +557,7 @@ class Config(Section, frozen=True, kw_only=True):
     gnss: dict[Name, Gnss] = field(default_factory=dict)
     wheel: dict[Name, Wheel] = field(default_factory=dict)
     barometer: dict[Name, Barometer] = field(default_factory=dict)
+    dual_antenna: dict[Name, DualAntenna] = field(default_factory=dict)
     directory: str = "."  # set on loading: where relative file names start
 
     def path(self, name: str) -> Path:
@@ -457,11 +596,11 @@ def sensor_tables() -> dict[str, type[Sensor]]:
     return {table: kind for table, kind in kinds.items() if issubclass(kind, Sensor)}
 
 
-MOST_SCALES = 4
+MAX_SCALES = 4
 
 
 def wheel_groups(config: Config) -> dict[str, int]:
-    """Of each wheel, the number of the scale that it shares with others: with all, with those of its axle, with none.
+    """For each wheel the number of its scale, which it shares with all wheels, with those of its axle, or with none.
     Axles are counted from the rear, wheels by name."""
     by = config.filter.wheel_scale_by
     keys = {name: {"vehicle": 0, "axle": wheel.position_m[0], "wheel": name}[by] for name, wheel in config.wheel.items()}
@@ -470,5 +609,5 @@ def wheel_groups(config: Config) -> dict[str, int]:
 
 
 def calibrated(gnss: Gnss) -> bool:
-    """Whether the filter learns anything of a receiver's installation."""
+    """Whether the filter estimates anything of a receiver's installation."""
     return max(gnss.lever_arm_sigma_m, gnss.delay_sigma_ms, gnss.velocity_delay_sigma_ms) > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args, get_origin
 
@@ -54,7 +54,7 @@ def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
         raise ConfigError(_explain(str(error), table, text, path, kind=kind, given=given)) from error
 
 
-def refuse(complaints: list[tuple[str, str]], text: str, path: Path) -> None:
+def refuse(complaints: Iterable[tuple[str, str]], text: str, path: Path) -> None:
     """Raise ConfigError for the first of the complaints (dotted key, what is wrong), if there is one."""
     for key, complaint in complaints:
         raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")

@@ -8,9 +8,9 @@ no stamp       t = receipt - delay.
 unix           trusted as it is (aim 0) while receipt - stamp is plausible: -FUTURE_TOLERANCE to PLAUSIBLE_LATENCY. The
                first stamp decides, so each has its result at once; trust is lost only by three stamps in a row over
                TRUST_LOST_AFTER, and regained by a plausible re-alignment, or when the least offset creeps back. Without
-               it: least offset. A host ahead by less than PLAUSIBLE_LATENCY cannot be told from a slow link.
+               it: least offset. A host ahead by less than PLAUSIBLE_LATENCY cannot be distinguished from a slow link.
 boot + trips   (TIMESYNC) boot to the host's line by round trips, see `RoundTrips`; while that is plausible against the
-               least offset. Together with pairs it also tells the host's offset from Unix time, which is then the aim
+               least offset. Together with pairs it also gives the host's offset from Unix time, which is then the aim
                of Unix stamps, trusted or not: so a host whose clock is wrong puts both where they belong.
 boot + pairs   (SYSTEM_TIME) boot to Unix by the least of Unix less boot, as boot is cut off to a millisecond; while
                Unix is trusted and the result is plausible against the least offset; else least offset.
@@ -27,7 +27,7 @@ fallen         late by over PLAUSIBLE_LATENCY and FALL behind the newest stamp: 
 late           by as much, without a fall: a stalled link, or the host was set forward. Keeps its alignment; if it stays
                equally late for 2 s of both clocks (10 s where it is only SLOW), the clock has moved.
 What stamps of one source agree on re-aligns the clock at once: a new epoch, counted, which may step either way. A stamp
-of any source that fits breaks every row; a repeated one adds nothing. Invalid payloads are stamped, but teach nothing.
+of any source that fits ends every streak; a repeated one adds nothing. Invalid payloads are stamped, but not learnt from.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ FUTURE_TOLERANCE = 50 * MILLISECOND  # an aligned stamp may lie this far after i
 PLAUSIBLE_LATENCY = 2 * SECOND  # a stamp later than this (boot clock: beyond what is usual for its source) does not fit
 FALL = SECOND  # a stamp this far behind the newest one is no matter of order
 SLOW = 100 * MILLISECOND  # beyond the source's usual lateness: a congested link, or a clock has moved, if it lasts
-CONSISTENT = 250 * MILLISECOND  # stamps in a row agree on a new offset within this
+CONSISTENT = 250 * MILLISECOND  # consecutive stamps agree on a new offset within this
 PAIR_TOLERANCE = 20 * MILLISECOND  # a clock pair off by more is odd; two odd ones that agree start anew
 TRUST_LOST_AFTER = 1_500 * MILLISECOND  # of stamps that contradict, without one that fits
 
@@ -87,7 +87,7 @@ class _Verdict(Enum):
 
 FITS = _Verdict.FITS  # what nearly all stamps do
 _REASONS = {_Verdict.FUTURE: "stamped in the future", _Verdict.FALLEN: "clock jump"}
-_CONFIRMATION = {  # stamps in a row that agree, and the time which they span on both clocks
+_CONFIRMATION = {  # consecutive stamps that agree, and the time that they span on both clocks
     _Verdict.FUTURE: (2, 0),
     _Verdict.FALLEN: (2, 0),
     _Verdict.LATE: (3, 2 * SECOND),
@@ -96,8 +96,8 @@ _CONFIRMATION = {  # stamps in a row that agree, and the time which they span on
 
 
 @dataclass(slots=True)
-class _Row:
-    """Stamps of one source in a row that do not fit and agree on another offset."""
+class _Streak:
+    """Consecutive stamps of one source that do not fit and agree on another offset."""
 
     verdict: _Verdict  # the first one's
     first_receive: int
@@ -108,8 +108,8 @@ class _Row:
     count: int = 1
 
     def continued(self, verdict: _Verdict, receive: int, offset: int) -> bool:
-        alike = (verdict is _Verdict.FUTURE) == (self.verdict is _Verdict.FUTURE)
-        return alike and receive >= self.first_receive and abs(offset - self.offset) <= CONSISTENT
+        same = (verdict is _Verdict.FUTURE) == (self.verdict is _Verdict.FUTURE)
+        return same and receive >= self.first_receive and abs(offset - self.offset) <= CONSISTENT
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,14 +132,14 @@ class _Aligner:
 
     def __init__(self, unix: _Aligner | None) -> None:
         self.samples = self.resets = self.strays = 0
-        self.complaint = ""  # why pairs are not in use
+        self.complaint = ""  # why pairs are not used
         self._unix = unix
         self._pieces: deque[_Piece] = deque(maxlen=PIECES)
 
     def _begin(self, stamp: int, receive: int, offset: int) -> None:
         """Forget everything; from here on, receipt less stamp is `offset` or more."""
         self._floor = OffsetFloor(receive, offset)
-        self._rows: dict[str, _Row] = {}
+        self._streaks: dict[str, _Streak] = {}
         self._pairs: OffsetFloor | None = None  # unix less boot
         self._odd_pair: int | None = None
         self._trips = RoundTrips()
@@ -195,7 +195,7 @@ class _Aligner:
         usual = self._usual.get(source, 0) if self._usual else 0
         verdict = FITS if -FUTURE_TOLERANCE <= late <= SLOW else self._judge(stamp, late, usual)
         if verdict is FITS:
-            if self._rows or late < usual:
+            if self._streaks or late < usual:
                 self._fits(source, late)
             self._floor.add(receive, offset)
         elif (agreed := self._agreed(verdict, source, stamp, receive, late)) is not None:
@@ -252,30 +252,30 @@ class _Aligner:
 
     def _fits(self, source: str, late: int) -> None:
         """The clock has not moved: what is slow meanwhile is usually so."""
-        if self._rows:
-            self._usual |= {name: row.late for name, row in self._rows.items() if row.verdict is _Verdict.SLOW}
-            self._rows.clear()
+        if self._streaks:
+            self._usual |= {name: streak.late for name, streak in self._streaks.items() if streak.verdict is _Verdict.SLOW}
+            self._streaks.clear()
         if late < self._usual.get(source, 0):
             self._usual[source] = max(0, late)
 
     def _agreed(self, verdict: _Verdict, source: str, stamp: int, receive: int, late: int) -> int | None:
-        """The offset to align anew to, once enough stamps of a source in a row agree on one."""
+        """The offset to align anew to, once enough consecutive stamps of a source agree on one."""
         offset = receive - stamp
-        row = self._rows.get(source)
-        if row is None or not row.continued(verdict, receive, offset):
-            self._rows[source] = _Row(verdict, receive, stamp, stamp, offset, late)
+        streak = self._streaks.get(source)
+        if streak is None or not streak.continued(verdict, receive, offset):
+            self._streaks[source] = _Streak(verdict, receive, stamp, stamp, offset, late)
             return None
-        if stamp == row.last_stamp:
+        if stamp == streak.last_stamp:
             return None
-        row.count += 1
-        row.last_stamp = stamp
-        row.offset = min(row.offset, offset)
-        row.late = min(row.late, late)
-        count, span = _CONFIRMATION[row.verdict]
+        streak.count += 1
+        streak.last_stamp = stamp
+        streak.offset = min(streak.offset, offset)
+        streak.late = min(streak.late, late)
+        count, span = _CONFIRMATION[streak.verdict]
         if self._unix is None and self.trusted:
             count, span = max(count, 3), max(span, TRUST_LOST_AFTER)
-        agreed = row.count >= count and min(receive - row.first_receive, abs(stamp - row.first_stamp)) >= span
-        return row.offset if agreed else None
+        agreed = streak.count >= count and min(receive - streak.first_receive, abs(stamp - streak.first_stamp)) >= span
+        return streak.offset if agreed else None
 
     def learn_pair(self, unix_less_boot: int, receive: int) -> None:
         """Take the difference of the Unix clock and this one, read at one instant."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fusiond.timeline.least_offset import OffsetFloor
 
 MILLISECOND = 1_000_000  # ns
-LONGEST = 10 * MILLISECOND  # a round trip that takes longer tells too little (as PX4)
+LONGEST = 10 * MILLISECOND  # a round trip that takes longer is too inaccurate (as in PX4)
 DEVIATION = 20 * MILLISECOND  # no two good round trips of steady clocks can differ by so much
 DEVIATIONS = 5  # so many in a row that do: a clock has moved, and everything is learnt anew (as PX4)
 

@@ -23,7 +23,7 @@ from fusiond.app.live.estimator_thread import Estimator
 from fusiond.app.live.live_engine import LiveEngine
 from fusiond.app.state_file import StateFile
 from fusiond.config.changes import changes
-from fusiond.config.schema import Config
+from fusiond.config.schema import Config, sensor_tables
 from fusiond.config.toml import ConfigError
 from fusiond.filter.stored_state import to_text
 from fusiond.messages.info import config_message, info_message
@@ -374,7 +374,7 @@ class Daemon:
         self._notifier.ready(self.status())
 
     def _adopt(self, new: Config, keys: Sequence[str]) -> None:
-        rates = any(key.startswith("imu.") for key in keys)
+        rates = any(key.partition(".")[0] in sensor_tables() for key in keys)
         for name, source in self.inputs.items():
             if any(key.startswith(f"{name}.") for key in keys) or (rates and name.startswith("mavlink.")):
                 source.configure(new)

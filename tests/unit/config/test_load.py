@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fusiond.config import load as config
-from fusiond.config.schema import Config
+from fusiond.config.schema import Config, sensor_tables
 from fusiond.config.toml import ConfigError
 
 CAR = Path("/etc/fusiond/car.toml")
@@ -153,6 +153,85 @@ def test_the_fault_is_found_in_the_right_table_of_many() -> None:
 )
 def test_contradictions(text: str, line: int, key: str, parts: list[str]) -> None:
     check(BASE + text, line, key, *parts)
+
+
+SENSORS = {  # a table of each kind of sensor, its last line the input that it comes by
+    "imu.imu0": "link = 'autopilot'",
+    "gnss.gps0": "link = 'autopilot'",
+    "wheel.left": "message = 'm'\nsignal = 's'\nbus = 'chassis'",
+    "wheel.right": "index = 2\nlink = 'autopilot'",
+    "barometer.b": "link = 'autopilot'",
+    "dual_antenna.yaw": "link = 'autopilot'",
+}
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_typing_error_in_an_input_names_what_was_meant(sensor: str) -> None:
+    others = "[mavlink.radio]\n[mavlink.autopilot]\n[can.chassis]\n"
+    imu = "" if sensor == "imu.imu0" else f"[imu.imu0]\n{SENSORS['imu.imu0']}\n"
+    text = f"{others}{imu}[{sensor}]\n{SENSORS[sensor]}"
+    key, _, name = text.splitlines()[-1].partition(" = ")
+    table, name = {"link": "mavlink", "bus": "can"}[key], name.strip("'")
+    wrong = text.removesuffix("'") + "s'"
+    check(wrong, wrong.count("\n") + 1, f"{sensor}.{key}",
+          f"there is no [{table}.{name}s] (did you mean '{name}'?)", "configured: ", name)  # fmt: skip
+
+
+def test_every_kind_of_sensor_is_tried_with_a_typing_error() -> None:
+    assert {sensor.partition(".")[0] for sensor in SENSORS} == set(sensor_tables())
+
+
+def test_a_name_that_is_like_none_is_only_refused() -> None:
+    assert "did you mean" not in complaint(BASE + GNSS.replace("autopilot", "xyz"))
+
+
+def test_a_typing_error_in_the_link_of_an_output() -> None:
+    for table in ("autopilot", "ground_station"):
+        text = f"[{table}]\nlink = 'autopilto'"
+        check(BASE + text, 5, f"{table}.link", "no [mavlink.autopilto]", "did you mean 'autopilot'?")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "origin"),
+    [
+        ("[gnss.a]\nlink = 'fc'", "[gnss.b]\nlink = 'fc'\nstamp = 'arrival'", "GPS_RAW_INT of fc"),
+        ("[dual_antenna.a]\nlink = 'fc'", "[dual_antenna.b]\nlink = 'fc'\noffset_deg = 90", "GPS_RAW_INT of fc"),
+        ("[wheel.a]\nlink = 'fc'\nindex = 1", "[wheel.b]\nlink = 'fc'\nindex = 1", "WHEEL_DISTANCE[1] of fc"),
+        (
+            "[wheel.a]\nbus = 'body'\nmessage = 'm'\nsignal = 's'",
+            "[wheel.b]\nbus = 'body'\nmessage = 'm'\nsignal = 's'\nunit = 'mph'",
+            "m.s of body",
+        ),
+    ],
+)
+def test_two_sensors_of_a_kind_cannot_read_the_same(tmp_path: Path, first: str, second: str, origin: str) -> None:
+    (tmp_path / DBC).touch()
+    text = f"[mavlink.fc]\n[mavlink.other]\n[can.body]\ndbc = ['{DBC}']\n[imu.imu0]\nlink = 'fc'\n{first}\n"
+    file = tmp_path / "car.toml"
+    table = second.partition(".")[0].strip("[")
+    message = complaint(text + second, file)
+    assert f": {table}.b: reads the same as [{table}.a]: {origin}" in message
+    for mine, other in (("'fc'", "'other'"), ("index = 1", "index = 2"), ("signal = 's'", "signal = 't'")):
+        if mine in second:
+            assert config.parse(text + second.replace(mine, other), file)
+
+
+def test_sensors_of_two_kinds_can_read_one_message() -> None:
+    both = config.parse(BASE + GNSS + "[dual_antenna.yaw0]\nlink = 'autopilot'\n")
+    assert both.sources() == ("gps0.position", "gps0.velocity", "imu0", "yaw0")
+
+
+@pytest.mark.parametrize("reader", ["gnss.gps1", "dual_antenna.yaw0"])
+def test_what_is_sent_to_the_autopilot_must_not_come_back_as_a_measurement(reader: str) -> None:
+    text = f"[{reader}]\nlink = 'autopilot'\nmessage = 'GPS2_RAW'\n[autopilot]\nlink = 'autopilot'\nmessage = 'gps_input'\n"
+    check(BASE + text, 7, "autopilot.gps_id", "send it back as GPS2_RAW", f"[{reader}] reads")
+    assert config.parse(BASE + text.replace("GPS2_RAW", "GPS_RAW_INT")).autopilot.gps_id == 1
+
+
+@pytest.mark.parametrize("sensor", ["gnss.gps0", "barometer.b", "dual_antenna.yaw0"])
+def test_bounds_of_the_learnt_noise_are_in_order(sensor: str) -> None:
+    text = f"[{sensor}]\nlink = 'autopilot'\nnoise_most = 2\nnoise_least = 2.5"
+    check(BASE + text, 7, f"{sensor}.noise_least", "must not exceed noise_most (2)")
 
 
 def test_no_imu() -> None:

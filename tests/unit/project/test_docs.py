@@ -6,17 +6,12 @@ import re
 import tomllib
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-import numpy as np
 import pytest
 
-from fusiond import events as measurements
 from fusiond.__main__ import parser
 from fusiond.config import load as config
 from fusiond.config import schema as sections
-from fusiond.filter.observations.model import mat_eb
-from fusiond.filter.state import VELOCITY, VELOCITY_E, FilterState
 from fusiond.simulation import scenario
 from tests.helpers.paths import ROOT
 
@@ -104,20 +99,24 @@ def test_the_examples_of_the_workshop_guide_hold(tmp_path: Path) -> None:
     assert parsed.wheel["rear_left"].counter_signal == "COUNTER"
 
 
-def test_the_example_of_a_model_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 10 m/s forward, with the radar 2 m ahead of the IMU."""
-    monkeypatch.setattr(sections, "Radar", sections.Wheel, raising=False)
-    monkeypatch.setattr(measurements, "RadarSpeed", measurements.WheelSpeed, raising=False)
-    model: dict[str, Any] = {}
-    exec(examples("adding.md", "python")[0], model)
-    radar = sections.Wheel(position_m=(2.0, 0.0, 0.5), sigma_mps=0.1)
-    state = FilterState(1)
-    state.nominal[VELOCITY_E] = mat_eb(state) @ (10.0, 0.0, 0.0)
-    row = np.array(model["values"](measurements.WheelSpeed(10.2), radar))
-    seen = model["observe"](state, row, model["parameters"](radar))
-    assert seen.innovation == pytest.approx([0.2])
-    assert seen.variance == pytest.approx([0.01])
-    assert seen.jacobian[0, VELOCITY] == pytest.approx(mat_eb(state)[:, 0])
+def test_the_code_of_the_walk_through_is_that_of_the_tree() -> None:
+    """Each block names its file in the first line; what stands between lines of dots is in it, word for word."""
+    blocks = examples("adding.md", "python")
+    assert len(blocks) >= 4
+    for block in blocks:
+        first, *lines = block.splitlines()
+        text = (ROOT / first.removeprefix("# ")).read_text(encoding="utf-8")
+        for part in re.split(r"^ *\.\.\.$", "\n".join(lines), flags=re.MULTILINE):
+            assert part.strip("\n") in text, f"{first}: {part}"
+
+
+def test_the_walk_through_names_files_of_the_tree() -> None:
+    text = (DOCS / "adding.md").read_text(encoding="utf-8")
+    walk = text[text.index("## A sensor") : text.index("## An input protocol")]
+    places = re.findall(r"^### (\d)\. .*, `([\w/.]+)`$", walk, re.MULTILINE)
+    assert [number for number, _ in places] == ["1", "2", "3", "4", "5"]
+    named = {name for _, name in places} | set(re.findall(r"`(\w[\w/]+\.py)`", walk))
+    assert all((ROOT / name).is_file() for name in named)
 
 
 def test_the_example_of_a_scenario_is_one() -> None:

@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusiond.config import load as config
+from fusiond.config.schema import sensor_tables
 from fusiond.config.toml import ConfigError
 from fusiond.events import Invalid, Received, WheelSpeed
 from fusiond_adapters.can.checksums import is_right
-from fusiond_adapters.can.decoder import CanDecoder, parameter_group
+from fusiond_adapters.can.decoder import READERS, CanDecoder, parameter_group
 from tests.helpers.paths import ROOT
 
 CONFIGS = ROOT / "configs"
@@ -284,7 +285,7 @@ def test_a_signal_is_what_cantools_decodes(
     (event,) = decoder(folder, wheel(message="M", signal="S", more='unit = "m/s"')).decode(1, False, data, 0)
     message = cantools.database.load_string(text, "dbc").messages[0]
     expected = message.decode_simple(data, decode_choices=False, allow_truncated=True)
-    assert event.payload == (WheelSpeed(expected["S"]) if "S" in expected else Invalid("short frame"))
+    assert event.payload == (WheelSpeed(float(expected["S"])) if "S" in expected else Invalid("short frame"))
     assert "S" in expected or len(data) < size
 
 
@@ -292,3 +293,7 @@ def test_signals_that_share_bits_are_decoded_all_the_same(folder: Path) -> None:
     (folder / "body.dbc").write_text(DBC.replace(" SG_ COUNTER", ' SG_ BOTH : 0|32@1+ (1,0) [0|0] "" E\n SG_ COUNTER'))
     (event,) = decoder(folder, wheel()).decode(256, False, bytes([100, 0, 0, 0, 0, 0, 0, 0]), 0)
     assert event.payload == WheelSpeed(100 * 0.01 * (1 / 3.6))
+
+
+def test_every_kind_of_sensor_that_can_come_by_a_bus_has_a_reader() -> None:
+    assert set(READERS) == {kind for kind in sensor_tables().values() if "bus" in kind.__struct_fields__}

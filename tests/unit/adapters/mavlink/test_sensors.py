@@ -1,4 +1,4 @@
-"""WHEEL_DISTANCE and SCALED_PRESSURE to events, and TIMESYNC's answers; what a counter may do, and what it may not."""
+"""WHEEL_DISTANCE, SCALED_PRESSURE and the yaw of GPS_RAW_INT to events, and TIMESYNC's answers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,23 @@ import pymavlink.dialects.v20.ardupilotmega as dialect
 import pytest
 
 from fusiond.config import load as config
+from fusiond.config.schema import sensor_tables
 from fusiond.config.toml import ConfigError
-from fusiond.events import HOST_CLOCK, ClockPair, Invalid, Pressure, Received, WheelSpeed
+from fusiond.events import (
+    HOST_CLOCK,
+    ClockPair,
+    GnssPosition,
+    GnssYaw,
+    Invalid,
+    Pressure,
+    Received,
+    WheelSpeed,
+)
 from fusiond_adapters.mavlink.decoder import TIMESYNC_MARK, MavlinkDecoder
+from fusiond_adapters.mavlink.sensors import HANDLERS
 
 BASE = '[mavlink.fc]\nsystem = 1\n[imu.imu0]\nlink = "fc"\n'
+YAW = BASE + '[dual_antenna.yaw0]\nlink = "fc"\n'
 WHEELS = BASE + '[wheel.left]\nlink = "fc"\nindex = 0\nunsigned = false\n[wheel.right]\nlink = "fc"\nindex = 1\n'
 MS = 1_000_000
 T0 = 1_700_000_000_000 * MS
@@ -34,6 +46,12 @@ class Vehicle:
         values = [*distances, *(0.0,) * (16 - len(distances))]
         message = dialect.MAVLink_wheel_distance_message(round(boot * 1000), len(distances), values)
         return self.send(message, boot if receive is None else receive)
+
+
+    def fix(self, kind: str = "GPS_RAW_INT", receive: float = 1000, **fields: int) -> list[Received]:
+        message = getattr(dialect, f"MAVLink_{kind.lower()}_message")
+        values = {"time_usec": 900_000, "fix_type": 3, "lat": 481234567, "lon": 115234567, "yaw": 9000} | fields
+        return self.send(message(**dict.fromkeys(message.fieldnames, 0) | values), receive)
 
 
 def payloads(events: list[Received]) -> list[object]:
@@ -113,6 +131,52 @@ def test_pressure_in_pascal_and_kelvin(kind: str) -> None:
         for values in ((0.0, 0.0, 2500), (math.nan, 0.0, 2500), (1013.0, 0.0, 32767))
     ]
     assert reasons == [[Invalid("impossible pressure")], [Invalid("not finite")], [Invalid("impossible temperature")]]
+
+
+def test_every_kind_of_sensor_that_can_come_by_a_link_has_a_handler() -> None:
+    assert set(HANDLERS) == {kind for kind in sensor_tables().values() if "link" in kind.__struct_fields__}
+
+
+@pytest.mark.parametrize("kind", ["GPS_RAW_INT", "GPS2_RAW"])
+def test_the_yaw_of_two_antennas(kind: str) -> None:
+    vehicle = Vehicle(YAW + f'message = "{kind}"')
+    (event,) = vehicle.fix(kind, yaw=12345, hdg_acc=150_000)
+    assert (event.source, event.clock, event.t_sensor_ns) == ("yaw0", "fc/1/boot", 900 * MS)
+    assert event.payload == GnssYaw(pytest.approx(math.radians(123.45)), pytest.approx(math.radians(1.5)))
+    (event,) = vehicle.fix(kind, yaw=36000)
+    assert event.payload == GnssYaw(pytest.approx(2 * math.pi), None)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"yaw": 0}, "no yaw given"),
+        ({"yaw": 65535}, "no yaw at present"),
+        ({"yaw": 36001}, "impossible yaw"),
+        ({"fix_type": 2}, "no fix"),
+    ],
+)
+def test_a_yaw_that_is_none_is_counted(fields: dict[str, int], reason: str) -> None:
+    assert payloads(Vehicle(YAW).fix(**fields)) == [Invalid(reason)]
+
+
+def test_the_fix_and_the_stamp_that_a_yaw_needs_are_configured() -> None:
+    vehicle = Vehicle(YAW + 'minimum_fix_type = 6\nstamp = "arrival"')
+    assert payloads(vehicle.fix(fix_type=5)) == [Invalid("no fix")]
+    (event,) = vehicle.fix(fix_type=6)
+    assert (event.clock, event.t_sensor_ns, event.payload) == ("", None, GnssYaw(math.pi / 2))
+
+
+def test_position_and_yaw_of_one_message_are_two_sensors() -> None:
+    """Each gets its own fields of it, whichever stands first, and each its own delay and bounds."""
+    both = BASE + '[dual_antenna.yaw0]\nlink = "fc"\n[gnss.gps0]\nlink = "fc"\nuse_velocity = false\nminimum_fix_type = 5\n'
+    vehicle = Vehicle(both)
+    position, yaw = vehicle.fix(fix_type=5, h_acc=700, v_acc=900, yaw=18000, hdg_acc=50_000)
+    assert (position.source, yaw.source) == ("gps0.position", "yaw0")
+    assert position.payload == GnssPosition(math.radians(48.1234567), math.radians(11.5234567), 0.0, 0.7, 0.9)
+    assert yaw.payload == GnssYaw(pytest.approx(math.pi), pytest.approx(math.radians(0.5)))
+    assert payloads(vehicle.fix(fix_type=4)) == [Invalid("no fix"), GnssYaw(math.pi / 2)]
+    assert payloads(vehicle.fix("GPS2_RAW")) == []
 
 
 def test_answers_to_our_own_timesync_alone() -> None:

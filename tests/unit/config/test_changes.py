@@ -1,0 +1,42 @@
+"""Of two configurations: what a running daemon takes over, and what it refuses."""
+
+from __future__ import annotations
+
+import pytest
+
+from fusiond.config.changes import changes
+from fusiond.config.load import parse
+
+TEXT = """[mavlink.fc]
+[imu.imu0]
+link = "fc"
+rate_hz = 100.0
+[gnss.gps0]
+link = "fc"
+interval_s = 0.25
+[wheel.left]
+link = "fc"
+index = 0
+rate_hz = 10.0
+[barometer.baro]
+link = "fc"
+rate_hz = 10.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("rate_hz = 100.0", "rate_hz = 50.0", "imu.imu0.rate_hz"),
+        ("interval_s = 0.25", "interval_s = 0.5", "gnss.gps0.interval_s"),
+        ("index = 0\nrate_hz = 10.0", "index = 0\nrate_hz = 5.0", "wheel.left.rate_hz"),
+        ('baro]\nlink = "fc"\nrate_hz = 10.0', 'baro]\nlink = "fc"\nrate_hz = 5.0', "barometer.baro.rate_hz"),
+    ],
+)
+def test_the_rates_to_ask_for_change_live(old: str, new: str, key: str) -> None:
+    assert changes(parse(TEXT), parse(TEXT.replace(old, new))) == ((key,), ())
+
+
+def test_what_else_a_sensor_says_needs_a_restart() -> None:
+    new = TEXT.replace("rate_hz = 100.0", "rate_hz = 50.0\ndelay_ms = 3.0")
+    assert changes(parse(TEXT), parse(new)) == ((), ("imu.imu0.delay_ms",))

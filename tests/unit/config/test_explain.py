@@ -1,0 +1,106 @@
+"""What `fusiond check` prints of a configuration: a paragraph for each sensor, and what is probably not meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fusiond.config.explain import description, oddities
+from fusiond.config.load import parse
+from fusiond.config.schema import Config, sensor_tables
+
+TEXT = """
+[mavlink.fc]
+[can.body]
+dbc = ["car.dbc"]
+delay_ms = 4.0
+[imu.imu0]
+link = "fc"
+delay_ms = 4.0
+[gnss.gps0]
+link = "fc"
+lever_arm_m = [0.5, 0.0, -1.25]
+velocity_delay_ms = 70.0
+[dual_antenna.yaw0]
+link = "fc"
+offset_deg = 90.0
+stamp = "arrival"
+[wheel.left]
+bus = "body"
+message = "WHEELS"
+signal = "L"
+position_m = [-1.5, -0.75, 0.5]
+counter_signal = "COUNTER"
+[wheel.right]
+link = "fc"
+index = 1
+position_m = [-1.5, 0.75, 0.5]
+[barometer.baro]
+link = "fc"
+[motion]
+point_m = [-1.5, 0.0, 0.5]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "car.dbc").touch()
+    return tmp_path
+
+
+def read(folder: Path, text: str = TEXT) -> Config:
+    return parse(text, folder / "car.toml")
+
+
+def test_each_sensor_has_its_paragraph(folder: Path) -> None:
+    lines = list(description(read(folder)))
+    first = next(i for i, line in enumerate(lines) if line.startswith("IMU"))
+    last = next(i for i, line in enumerate(lines) if line.startswith("constraints"))
+    assert lines[first:last] == [
+        "IMU          imu0: HIGHRES_IMU of fc, delay 4 ms",
+        "             turned by 0 0 0 deg (roll, pitch, yaw) against forward-right-down",
+        "             noise 0.05 m/s^2/sqrt(Hz), 0.002 rad/s/sqrt(Hz)",
+        "GNSS         gps0: GPS_RAW_INT of fc, by its own stamp, no delay",
+        "             feeds gps0.position: sigma 1.5 m, in height 3 m",
+        "             feeds gps0.velocity: sigma 0.2 m/s, delay 70 ms",
+        "             antenna at 0.5 0 -1.25 m (forward, right, down) from the IMU",
+        "wheel        left: WHEELS.L of body in km/h, no delay",
+        "             at -1.5 -0.75 0.5 m (forward, right, down), not steered, amount only, sigma 0.1 m/s",
+        "             COUNTER must change",
+        "wheel        right: WHEEL_DISTANCE[1] of fc, no delay",
+        "             at -1.5 0.75 0.5 m (forward, right, down), not steered, amount only, sigma 0.1 m/s",
+        "barometer    baro: SCALED_PRESSURE of fc, no delay",
+        "             sigma 1 m about a height offset that is learnt",
+        "GNSS yaw     yaw0: GPS_RAW_INT of fc, by its arrival, no delay",
+        "             sigma 0.5 deg, baseline 90 deg clockwise from forward",
+    ]
+
+
+def test_labels_fit_their_column() -> None:
+    assert all(0 < len(kind.label) <= 12 for kind in sensor_tables().values())
+
+
+def test_nothing_is_odd_about_a_good_configuration(folder: Path) -> None:
+    assert list(oddities(read(folder))) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "oddity"),
+    [
+        ("velocity_delay_ms = 70.0", "velocity_delay_ms = 1500.0", "gnss.gps0 (velocity): its delay of 1500 ms is not"),
+        ("offset_deg = 90.0", "delay_ms = -5.0", "dual_antenna.yaw0: with a delay of -5 ms it would measure the future"),
+        ("delay_ms = 4.0\n[imu", "delay_ms = 2000.0\n[imu", "wheel.left: its delay of 2000 ms is not below"),
+        ("[0.5, 0.0, -1.25]", "[50.0, 0.0, -125.0]", "gnss.gps0.lever_arm_m: 50 0 -125 m (forward, right, down) is far"),
+        ("[-1.5, -0.75, 0.5]", "[0.0, 0.0, 0.0]", "wheel.left.position_m: 0 0 0 puts it where the IMU is"),
+        ("[mavlink.fc]", "[mavlink.fc]\n[can.chassis]", "can.chassis: no sensor comes by this bus"),
+    ],
+)
+def test_what_is_probably_not_meant(folder: Path, old: str, new: str, oddity: str) -> None:
+    (found,) = oddities(read(folder, TEXT.replace(old, new)))
+    assert found.startswith(oddity)
+
+
+def test_a_stream_that_is_turned_off_is_not_odd(folder: Path) -> None:
+    off = TEXT.replace("velocity_delay_ms = 70.0", "velocity_delay_ms = 1500.0\nuse_velocity = false")
+    assert list(oddities(read(folder, off))) == []
