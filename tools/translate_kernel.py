@@ -45,6 +45,7 @@ MODULES = (  # every function of these that is marked @compiled
     "fusiond.filter.observations.gnss_velocity",
     "fusiond.filter.observations.wheel_speed",
     "fusiond.filter.observations.barometric_height",
+    "fusiond.filter.observations.gnss_yaw",
     "fusiond.filter.observations.non_holonomic",
     "fusiond.filter.observations.zero_velocity",
     "fusiond.filter.observations.zero_rotation",
@@ -61,14 +62,14 @@ MODULES = (  # every function of these that is marked @compiled
 SIZES = {  # constants that the structs and the kernel's class need by name, and where they are
     "fusiond.filter.state": (
         "NOMINAL_SIZE", "AUXILIARY_SIZE", "MEMORY_SIZE", "STAMPS_SIZE", "SOURCE_STAMPS_SIZE", "HYPOTHESES", "CALIBRATIONS",
-        "PHASE", "CHOOSING", "T",
+        "WIDE_SIZE", "PHASE", "CHOOSING", "T",
     ),
     "fusiond.filter.observations.model": ("VALUES", "PARAMETERS"),
     "fusiond.filter.observations": ("IMU",),
     "fusiond.filter.north_east_down": ("ANSWER_SIZE",),
 }  # fmt: skip
 HEAD = """\
-# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n` is the number of error states.
+# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 """
 
 
@@ -854,7 +855,7 @@ class Translation:
             self._fail(node, "no translation of this operator")
         left, right = self._expression(node.left), self._expression(node.right)
         if left.kind.is_scalar and right.kind.is_scalar:
-            if sign == "/" and left.kind != FLOAT and right.kind != FLOAT:
+            if sign == "/" and FLOAT not in (left.kind, right.kind):
                 left = Value(f"<double>{left.code}", FLOAT)
             kind = FLOAT if FLOAT in (left.kind, right.kind) or sign == "/" else INT
             return Value(f"({left.code} {sign} {right.code})", kind)
@@ -1016,6 +1017,8 @@ def layout() -> str:
                 lines.append(f"    int32_t {name}")
             elif kind.is_scalar or kind.name == "struct" or (struct in ("State", "Plan") and name != "gates"):
                 lines.append(f"    {kind.c} {name}")
+            elif name == "jacobian":  # models name columns that only the wide state has
+                lines.append(f"    {kind.of} {name}[2 * n + WIDE_SIZE]")
             else:
                 lines.append(f"    {kind.of} {name}[{size_of(kind)}]")
             if struct == "Plan" and name in COUNTED:

@@ -18,7 +18,7 @@ from fusiond.filter.kernel.interpreted import AnyKernel
 from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations import IMU, MODELS
 from fusiond.filter.observations.model import Unusable, within
-from fusiond.filter.parameters import SECOND, nanoseconds, plan, section_of
+from fusiond.filter.parameters import SECOND, model_of, nanoseconds, plan
 from fusiond.filter.rows import Outcome
 from fusiond.filter.source_health import Belief, belief
 from fusiond.filter.state import (
@@ -79,8 +79,8 @@ class Fusion:
         self.history = History(self.plan, compiled)
         self._carried = FilterState(len(self.plan.sources), self.plan.size)  # the head, beyond the newest inertial sample
         self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
-            source: (imu_values if model == IMU else MODELS[model].values, section_of(source, model, config))
-            for source, model in zip(self.plan.sources, self.plan.models, strict=True)
+            source: (imu_values if (model := model_of(found.stream)) == IMU else MODELS[model].values, found.section)
+            for source, found in config.streams().items()
         }
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 

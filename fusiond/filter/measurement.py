@@ -142,8 +142,8 @@ def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 
 
 @compiled
 def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, plan: Plan) -> bool:
-    """Whether a GNSS source has been rejected for long, with the same error all the time, so that the state is more likely
-    the culprit: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
+    """Whether a GNSS source has been rejected for long, with the same error all the time, so that the state is likelier
+    at fault: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
     and much later for a velocity, or a position whose velocity is not trusted, because the rest of the vehicle then
     contradicts the receiver's motion, as in a slowly growing spoof."""
     memory, stamps = state.memory[source], state.source_stamps[source]

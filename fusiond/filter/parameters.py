@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from fusiond.config.schema import Config, Filter, Gnss, Imu, Wheel, calibrated, wheel_groups
+from fusiond.config.schema import Config, Filter, Imu, Source, calibrated, wheel_groups
+from fusiond.config.sensor import INERTIAL, Stream
 from fusiond.filter.measurement_update import correlation_factor
-from fusiond.filter.observations import CONSTRAINTS, IMU, MODEL, MODELS, wheel_speed
-from fusiond.filter.observations.model import CLUTTER, COMPANION, NOISE_MAX, NOISE_MIN, SHARED, empty_row
+from fusiond.filter.observations import CONSTRAINTS, GNSS_VELOCITY, IMU, MODEL, MODELS, WHEEL_SPEED, wheel_speed
+from fusiond.filter.observations.model import CLUTTER, COMPANION, CORRELATION, NOISE_MAX, NOISE_MIN, SHARED, empty_row
 from fusiond.filter.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
@@ -73,22 +73,12 @@ class Plan:
     max_stored_age_ns: int
 
 
-def section_of(source: str, model: int, config: Config) -> Any:
-    """The table of the configuration that a source stands in."""
-    if model == IMU:
-        return config.imu[source]
-    table: dict[str, Any] = getattr(config, MODELS[model].table)
-    return table[source.removesuffix(MODELS[model].suffix)]
-
-
 def plan(config: Config, stored: StoredState | None = None) -> Plan:
     """Lay a configuration out for the kernel, with what an earlier run has stored."""
-    found = dict.fromkeys(config.imu, IMU)
-    for number, model in enumerate(MODELS):
-        found |= {f"{name}{model.suffix}": number for name in getattr(config, model.table)}
-    sources = tuple(sorted(found))
-    models = tuple(found[source] for source in sources)
-    rows = [_parameters(source, sources, model, config) for source, model in zip(sources, models, strict=True)]
+    streams = config.streams()
+    sources = tuple(sorted(streams))
+    models = tuple(model_of(streams[source].stream) for source in sources)
+    rows = [_parameters(source, sources, config, streams) for source in sources]
     first, walks = _calibrations(config)
     (imu,) = config.imu.values()
     motion, settings = config.motion, config.filter
@@ -109,8 +99,8 @@ def plan(config: Config, stored: StoredState | None = None) -> Plan:
         scales=_scale_names(config),
         calibration_variances=first,
         imu_source=models.index(IMU),
-        wheels=tuple(i for i, model in enumerate(models) if model == MODEL["wheel_speed"]),
-        velocities=tuple(i for i, model in enumerate(models) if model == MODEL["gnss_velocity"]),
+        wheels=tuple(i for i, model in enumerate(models) if model == WHEEL_SPEED),
+        velocities=tuple(i for i, model in enumerate(models) if model == GNSS_VELOCITY),
         horizon_ns=nanoseconds(settings.horizon_s),
         snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
         imu_gap_ns=nanoseconds(settings.imu_gap_s),
@@ -134,35 +124,36 @@ def plan(config: Config, stored: StoredState | None = None) -> Plan:
     )
 
 
-def _parameters(source: str, sources: tuple[str, ...], model: int, config: Config) -> Array:
+def model_of(stream: Stream) -> int:
+    """The place in MODELS of the model that a stream feeds, or IMU."""
+    return IMU if stream.model == INERTIAL else MODEL[stream.model]
+
+
+def _parameters(source: str, sources: tuple[str, ...], config: Config, streams: dict[str, Source]) -> Array:
     """The row of one source: what its model wants, and what all have."""
+    table, name, section, stream, _ = streams[source]
+    model = model_of(stream)
     if model == IMU:
         return empty_row()
-    section = section_of(source, model, config)
     row = MODELS[model].parameters(section)
-    row[NOISE_MIN], row[NOISE_MAX] = square(section.noise_least), square(section.noise_most)
-    row[SHARED] = _shared(section, model, config)
-    if model == MODEL["wheel_speed"]:
+    row[CORRELATION] = stream.correlation_s
+    row[NOISE_MIN], row[NOISE_MAX] = square(stream.noise_min), square(stream.noise_max)
+    row[SHARED] = _shared(table, stream, streams)
+    row[CLUTTER] = stream.outlier_share
+    if stream.companion is not None:
+        row[COMPANION] = sources.index(name + stream.companion)
+    if model == WHEEL_SPEED:
         row[wheel_speed.SCALE_STATE] = scale_state(wheel_groups(config)[source])
-    if not isinstance(section, Gnss):
-        return row
-    row[CLUTTER] = section.outlier_share if section.outliers == "mixture" else 0.0
-    velocity = source.removesuffix(".position") + ".velocity"
-    if model == MODEL["gnss_position"] and velocity in sources:
-        row[COMPANION] = sources.index(velocity)
     return row
 
 
-def _shared(section: Any, model: int, config: Config) -> float:
+def _shared(table: str, stream: Stream, streams: dict[str, Source]) -> float:
     """By what each variance s_i^2 of a group grows so that all of them, fused one by one, are worth no more than their
     shared error s_c allows (THEORY A5): with 1 + s_c^2 sum 1 / s_j^2 they are worth s_c^2 + 1 / sum 1 / s_j^2 together."""
-    if not isinstance(section, Gnss | Wheel) or section.group is None or model == MODEL["gnss_velocity"]:
+    if stream.group is None:
         return 1.0
-    if isinstance(section, Wheel):
-        sigmas = [wheel.sigma_mps for wheel in config.wheel.values() if wheel.group == section.group]
-        return 1 + square(section.shared_sigma_mps) * sum(1 / square(sigma) for sigma in sigmas)
-    sigmas = [gnss.position_sigma_m for gnss in config.gnss.values() if gnss.group == section.group]
-    return 1 + square(section.shared_sigma_m) * sum(1 / square(sigma) for sigma in sigmas)
+    group = [other.stream.sigma for other in streams.values() if (other.table, other.stream.group) == (table, stream.group)]
+    return 1 + square(stream.shared_sigma) * sum(1 / square(sigma) for sigma in group)
 
 
 def _scale_names(config: Config) -> tuple[str, ...]:

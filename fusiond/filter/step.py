@@ -146,8 +146,8 @@ def _forget_judgement(row: Row) -> None:
 @compiled
 def _measure_lost(state: FilterState, row: Row, plan: Plan, variance: float) -> bool:
     """Fuse a measurement when the heading, of so much variance after coasting, is lost. It may correct position and
-    velocity; what it says of a heading that is so far off is not to be relied on. When the IMU is back, an alignment finds it. Returns
-    whether it was fused."""
+    velocity; what it says of a heading that is so far off is not to be relied on. When the IMU is back, an alignment finds
+    it. Returns whether it was fused."""
     fused = measure(state, row, plan)
     gained = variance - yaw_variance(state)
     if gained > 0:

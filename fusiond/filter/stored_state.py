@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from fusiond.config.schema import Config
+from fusiond.config.schema import Config, sensor_tables
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ACCEL_BIAS_B,
@@ -65,7 +65,7 @@ class StoredState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 def installation(config: Config) -> int:
     """A number that changes when the configuration of sensors does: what is learnt is learnt against it."""
-    parts = (config.imu, config.gnss, config.wheel, config.barometer, config.filter.wheel_scale_by)
+    parts = ({table: getattr(config, table) for table in sensor_tables()}, config.filter.wheel_scale_by)
     return zlib.crc32(msgspec.json.encode(parts, order="sorted"))
 
 

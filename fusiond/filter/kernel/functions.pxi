@@ -1,4 +1,4 @@
-# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n` is the number of error states.
+# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 
 cdef double[4] PRIOR = [0.997, 0.001, 0.001, 0.001]
@@ -1105,6 +1105,38 @@ cdef bint barometric_height_observe(State* state, double* row, double* parameter
     seen.variance[0] = row[1]
     return True
 
+# ---------------- fusiond.filter.observations.gnss_yaw
+
+cdef bint gnss_yaw_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double to_n[3 * 3]
+    cdef double baseline_e[3]
+    cdef double _t1[3 * 3]
+    cdef double baseline_n[3]
+    cdef double north
+    cdef double east
+    cdef double level
+    cdef double by_attitude[3 * n]
+    cdef int64_t i
+    cdef double sine
+    cdef double cosine
+    wgs84_mat_ne(state.nominal, to_n)
+    model_mat_eb(state, _t1)
+    rotation_times(_t1, parameter + 4, baseline_e)
+    rotation_times(to_n, baseline_e, baseline_n)
+    north, east = baseline_n[0], baseline_n[1]
+    level = ((north * north) + (east * east))
+    if (level < portable_square(0.2)):
+        return False
+    memset(by_attitude, 0, 3 * n * sizeof(double))
+    model_skew_rows(to_n, baseline_e, (-1.0), 2, by_attitude, 6)
+    model_begin(seen, 1)
+    for i in range(6, 9):
+        seen.jacobian[(0) * n + i] = (((north * by_attitude[(1) * n + i]) - (east * by_attitude[(0) * n + i])) / level)
+    sine, cosine = row[0], row[1]
+    seen.innovation[0] = portable_atan2(((north * sine) - (east * cosine)), ((north * cosine) + (east * sine)))
+    seen.variance[0] = row[2]
+    return True
+
 # ---------------- fusiond.filter.observations.non_holonomic
 
 cdef bint non_holonomic_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
@@ -1172,6 +1204,8 @@ cdef bint observations_observe(State* state, int64_t model, double* row, double*
         return wheel_speed_observe(state, row, parameter, seen)
     elif model == 3:
         return barometric_height_observe(state, row, parameter, seen)
+    elif model == 4:
+        return gnss_yaw_observe(state, row, parameter, seen)
     return False
 
 # ---------------- fusiond.filter.measurement_update

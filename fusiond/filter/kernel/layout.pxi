@@ -1,4 +1,4 @@
-# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n` is the number of error states.
+# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 cdef enum:
     NOMINAL_SIZE = 28
@@ -8,6 +8,7 @@ cdef enum:
     SOURCE_STAMPS_SIZE = 6
     HYPOTHESES = 13
     CALIBRATIONS = 15
+    WIDE_SIZE = 27
     PHASE = 9
     CHOOSING = 3
     T = 0
@@ -27,7 +28,7 @@ cdef struct Noise:
 cdef struct Observation:
     int64_t m
     double innovation[3]
-    double jacobian[3 * n]
+    double jacobian[2 * n + WIDE_SIZE]
     double variance[3]
 
 cdef struct Row:

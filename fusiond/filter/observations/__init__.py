@@ -9,6 +9,7 @@ from fusiond.filter.observations import (
     barometric_height,
     gnss_position,
     gnss_velocity,
+    gnss_yaw,
     non_holonomic,
     wheel_speed,
     zero_rotation,
@@ -20,30 +21,22 @@ from fusiond.maths.typed import Array, Vector, compiled
 
 
 class Model(NamedTuple):
-    """One kind of measurement. A source of it is called by the name of its table in the configuration, [table.NAME], with
-    the suffix. `values` makes a row of numbers of a payload and that table, `parameters` another of the table alone, and
-    `observe` takes both and fills an Observation."""
+    """One kind of measurement; a stream of a sensor names it (fusiond.config.sensor.Stream). `values` makes a row of numbers
+    of a payload and the sensor's table of the configuration, `parameters` another of the table alone, and `observe` takes
+    both and fills an Observation."""
 
     name: str
-    table: str
-    suffix: str
     parameters: Callable[[Any], Array]
     values: Callable[[Any, Any], tuple[float, ...]]
     observe: Callable[[FilterState, Array, Array, Observation], bool]
 
 
 MODELS = (
-    Model("gnss_position", "gnss", ".position", gnss_position.parameters, gnss_position.values, gnss_position.observe),
-    Model("gnss_velocity", "gnss", ".velocity", gnss_velocity.parameters, gnss_velocity.values, gnss_velocity.observe),
-    Model("wheel_speed", "wheel", "", wheel_speed.parameters, wheel_speed.values, wheel_speed.observe),
-    Model(
-        "barometric_height",
-        "barometer",
-        "",
-        barometric_height.parameters,
-        barometric_height.values,
-        barometric_height.observe,
-    ),
+    Model("gnss_position", gnss_position.parameters, gnss_position.values, gnss_position.observe),
+    Model("gnss_velocity", gnss_velocity.parameters, gnss_velocity.values, gnss_velocity.observe),
+    Model("wheel_speed", wheel_speed.parameters, wheel_speed.values, wheel_speed.observe),
+    Model("barometric_height", barometric_height.parameters, barometric_height.values, barometric_height.observe),
+    Model("gnss_yaw", gnss_yaw.parameters, gnss_yaw.values, gnss_yaw.observe),
 )
 IMU = -1  # stands for the inertial sensor where others have their place in MODELS
 MODEL = {model.name: number for number, model in enumerate(MODELS)}

@@ -7,7 +7,7 @@ import math
 
 from fusiond.config.schema import Barometer
 from fusiond.events import Pressure
-from fusiond.filter.observations.model import CORRELATION, RESETS, Observation, Unusable, begin, empty_row
+from fusiond.filter.observations.model import RESETS, Observation, Unusable, begin, empty_row
 from fusiond.filter.state import HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR, POSITION, POSITION_E, FilterState
 from fusiond.maths.portable import exp, log, square
 from fusiond.maths.typed import Array, Vector, compiled
@@ -28,7 +28,6 @@ LAYERS = (  # base: pressure [Pa], geopotential height [m], temperature [K], and
 
 def parameters(barometer: Barometer) -> Array:
     row = empty_row()
-    row[CORRELATION] = barometer.correlation_s
     row[RESETS] = HEIGHT_OFFSET_ERROR.start
     return row
 

@@ -10,7 +10,6 @@ from fusiond.config.schema import Gnss, calibrated
 from fusiond.events import GnssPosition
 from fusiond.filter.observations.model import (
     CALIBRATED,
-    CORRELATION,
     LEVER_ARM_B,
     RESETS,
     Observation,
@@ -50,7 +49,6 @@ HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
 def parameters(gnss: Gnss) -> Array:
     row = empty_row()
     row[LEVER_ARM_B] = gnss.lever_arm_m
-    row[CORRELATION] = gnss.position_correlation_s
     row[CALIBRATED] = float(calibrated(gnss))
     row[RESETS] = POSITION.start
     return row

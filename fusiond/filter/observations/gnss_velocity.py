@@ -8,7 +8,6 @@ from fusiond.config.schema import Gnss, calibrated
 from fusiond.events import GnssVelocity
 from fusiond.filter.observations.model import (
     CALIBRATED,
-    CORRELATION,
     LEVER_ARM_B,
     RESETS,
     SPEED_LIMIT,
@@ -49,7 +48,6 @@ AXES = 4  # values: 3, or 2 where the receiver gives no vertical speed
 def parameters(gnss: Gnss) -> Array:
     row = empty_row()
     row[LEVER_ARM_B] = gnss.lever_arm_m
-    row[CORRELATION] = gnss.velocity_correlation_s
     row[CALIBRATED] = float(calibrated(gnss))
     row[RESETS] = VELOCITY.start
     return row
