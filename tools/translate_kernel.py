@@ -3,7 +3,7 @@
     python tools/translate_kernel.py            write layout.pxi and functions.pxi in fusiond/filter/kernel
     python tools/translate_kernel.py --check    exit with 1 where one of them is not what would be written
 
-The filter's functions that run for every event are written once, in Python, in the modules listed in MODULES; the
+The filter's functions that run for every event are written once, in Python, in fusiond/maths and fusiond/filter; the
 interpreter runs them as they are. Here the same functions become C-level Cython: the same operations in the same order, so
 both give the same bits. What may stand in such a function is small on purpose:
 
@@ -23,7 +23,6 @@ from __future__ import annotations
 import ast
 import enum
 import importlib
-import inspect
 import math
 import sys
 from collections.abc import Iterator
@@ -34,31 +33,7 @@ from typing import NoReturn
 
 ROOT = Path(__file__).parents[1]
 KERNEL = ROOT / "fusiond" / "filter" / "kernel"
-MODULES = (  # every function of these that is marked @compiled
-    "fusiond.maths.portable",
-    "fusiond.maths.linear",
-    "fusiond.maths.rotation",
-    "fusiond.maths.wgs84",
-    "fusiond.filter.strapdown",
-    "fusiond.filter.observations.model",
-    "fusiond.filter.observations.gnss_position",
-    "fusiond.filter.observations.gnss_velocity",
-    "fusiond.filter.observations.wheel_speed",
-    "fusiond.filter.observations.barometric_height",
-    "fusiond.filter.observations.gnss_yaw",
-    "fusiond.filter.observations.non_holonomic",
-    "fusiond.filter.observations.zero_velocity",
-    "fusiond.filter.observations.zero_rotation",
-    "fusiond.filter.observations",
-    "fusiond.filter.measurement_update",
-    "fusiond.filter.source_health",
-    "fusiond.filter.motion_constraints",
-    "fusiond.filter.measurement",
-    "fusiond.filter.heading_bank",
-    "fusiond.filter.initial_alignment",
-    "fusiond.filter.north_east_down",
-    "fusiond.filter.step",
-)
+PACKAGES = ("maths", "filter")  # whose modules are searched for functions marked @compiled
 SIZES = {  # constants that the structs and the kernel's class need by name, and where they are
     "fusiond.filter.state": (
         "NOMINAL_SIZE", "AUXILIARY_SIZE", "MEMORY_SIZE", "STAMPS_SIZE", "SOURCE_STAMPS_SIZE", "HYPOTHESES", "CALIBRATIONS",
@@ -236,12 +211,21 @@ def size_of(kind: Kind) -> str:
     return f"{kind.size} * {kind.columns}" if kind.name == "matrix" else kind.size
 
 
+def modules() -> Iterator[tuple[str, str]]:
+    """Name and source of every module that may hold such functions."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / "fusiond" / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            source = path.read_text(encoding="utf-8")
+            if "\n@compiled" in source or "\n@primitive" in source:
+                yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), source
+
+
 def functions() -> dict[FunctionType, Function]:
-    """Every function marked @compiled, in the order of MODULES."""
+    """Every function marked @compiled, or called by them and written by hand."""
     found: dict[FunctionType, Function] = {}
-    for name in MODULES:
+    for name, source in modules():
         module = importlib.import_module(name)
-        source = Path(inspect.getfile(module)).read_text(encoding="utf-8")
         for tree in ast.parse(source).body:
             if not isinstance(tree, ast.FunctionDef):
                 continue

@@ -27,6 +27,7 @@ from fusiond.filter.state import (
     HEIGHT_OFFSET_ERROR,
     LAST_RATIO,
     LAST_SPEED,
+    LOWEST_SPEED,
     NEVER,
     POSITION_E,
     RESET_REASON,
@@ -64,7 +65,7 @@ def remember(memory: Vector, model: int, values: Vector) -> None:
     if model == WHEEL_SPEED:
         memory[LAST_SPEED] = values[wheel_speed.SPEED]
     elif model == GNSS_VELOCITY:
-        memory[LAST_SPEED] = lowest_speed(values)
+        memory[LOWEST_SPEED] = lowest_speed(values)
 
 
 @compiled

@@ -13,6 +13,7 @@ from fusiond.filter.state import (
     CONSTRAINT_REJECTED,
     INTERVAL,
     LAST_SPEED,
+    LOWEST_SPEED,
     MEAN_FORCE_B,
     MEAN_RATE_B,
     MEAN_WEIGHT,
@@ -75,7 +76,7 @@ def carried(state: FilterState, wheel_speed: float, plan: Plan) -> bool:
         return False
     for i in plan.velocities:
         fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS
-        if fresh and state.memory[i, LAST_SPEED] > CARRIED_SPEED and is_trusted(state.memory[i]):
+        if fresh and state.memory[i, LOWEST_SPEED] > CARRIED_SPEED and is_trusted(state.memory[i]):
             return True
     return False
 
@@ -102,7 +103,7 @@ def is_carried(state: FilterState, plan: Plan) -> bool:
 def disputed(state: FilterState, velocity: int, plan: Plan) -> bool:
     """Whether all wheels rest while a receiver, by its source `velocity` (-1: none), moves: either it is wrong, or the
     vehicle begins to be carried. Nobody is to be blamed for that."""
-    return velocity >= 0 and state.memory[velocity, LAST_SPEED] > 0.0 and rests(state, plan)
+    return velocity >= 0 and state.memory[velocity, LOWEST_SPEED] > 0.0 and rests(state, plan)
 
 
 @compiled

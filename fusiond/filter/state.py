@@ -14,97 +14,114 @@ import numpy as np
 
 from fusiond.maths.typed import Array, Stamps
 
-# Nominal state: slices of FilterState.nominal
-POSITION_E = slice(0, 3)  # m, of the IMU, earth-fixed
-VELOCITY_E = slice(3, 6)  # m/s, over ground, in earth-fixed axes
-QUATERNION_EB = slice(6, 10)  # body to earth-fixed
-GYRO_BIAS_B = slice(10, 13)  # rad/s
-ACCEL_BIAS_B = slice(13, 16)  # m/s^2
-WHEEL_SCALE = slice(16, 17)  # 1: what wheels read too much: those of the first group, which is all unless told otherwise
-MOUNT = slice(17, 19)  # rad: pitch and yaw of the IMU against the vehicle
-FURTHER_SCALES = slice(19, 22)  # 1: likewise, of the second to fourth group
-ANTENNA_B = slice(22, 25)  # m, what the antenna's lever arm is more than configured
-DELAYS = slice(25, 27)  # s, what the position's delay is more than configured, and the velocity's more than that
-HEIGHT_OFFSET = slice(27, 28)  # m, what the barometer reads too much
-NOMINAL_SIZE = 28
 
-# Error state: slices of a row or column of the covariance; true = nominal (+) error
-POSITION = slice(0, 3)  # m, e axes
-VELOCITY = slice(3, 6)  # m/s, e axes
-ATTITUDE = slice(6, 9)  # rad, e axes: mat_eb_true = exp([attitude]x) mat_eb
-GYRO_BIAS = slice(9, 12)  # rad/s, b axes
-ACCEL_BIAS = slice(12, 15)  # m/s^2, b axes
-SCALE = slice(15, 16)  # 1
-MOUNT_ERROR = slice(16, 18)  # rad
-ERROR_SIZE = 18
-FURTHER_SCALES_ERROR = slice(18, 21)  # 1; from here on only in a state of WIDE_SIZE
-ANTENNA_ERROR = slice(21, 24)  # m, b axes
-DELAYS_ERROR = slice(24, 26)  # s
-HEIGHT_OFFSET_ERROR = slice(26, 27)  # m
-WIDE_SIZE = 27
-CALIBRATIONS = 15  # error states from here on belong to the installation; their nominal states follow one higher
+class _Layout:
+    """Hands out the places of one array, one after the other: what is declared next comes next."""
 
-# Auxiliary numbers: slices of FilterState.auxiliary
-HELD_FORCE_B = slice(0, 3)  # m/s^2, the newest inertial sample behind the state
-HELD_RATE_B = slice(3, 6)  # rad/s
-FORCE_B = slice(6, 9)  # m/s^2, interpolated at the state's own instant
-RATE_B = slice(9, 12)  # rad/s
-MEAN_FORCE_B = slice(12, 15)  # m/s^2, exponential means and variances for leveling and for the motion detector
-MEAN_RATE_B = slice(15, 18)  # rad/s
-SCATTER_FORCE = 18  # (m/s^2)^2
-SCATTER_RATE = 19  # (rad/s)^2
-MEAN_WEIGHT = 20  # 1: how much of the mean is filled, in 0..1
-REST_RATE_B = slice(21, 24)  # rad/s, mean gyro of the last standstill before the start
-FIRST_VELOCITY_N = slice(24, 27)  # m/s, GNSS velocity at the begin of the alignment window
-FIX_E = slice(27, 30)  # m, last GNSS antenna position before the start
-FIX_VARIANCE = slice(30, 32)  # m^2, horizontal, vertical
-CONSTRAINT_RATIO = slice(32, 35)  # last test ratios: non-holonomic, zero velocity, zero rotation
-RATE_VARIANCE = 35  # (rad/s)^2, white noise of RATE_B, per axis
-SMOOTH_FORCE_B = slice(36, 39)  # m/s^2, mean over the delays of receivers
-AUXILIARY_SIZE = 39
+    def __init__(self) -> None:
+        self.size = 0
+
+    def one(self) -> int:
+        """The place of a number."""
+        self.size += 1
+        return self.size - 1
+
+    def block(self, count: int) -> slice:
+        """The places of several."""
+        self.size += count
+        return slice(self.size - count, self.size)
+
+
+_nominal, _error = _Layout(), _Layout()
+
+
+def _state(count: int) -> tuple[slice, slice]:
+    """A block of states that errors add to: its places in the nominal state, and in a row or column of the covariance."""
+    return _nominal.block(count), _error.block(count)
+
+
+# The state: places in FilterState.nominal, and of its error in the covariance; true = nominal (+) error
+POSITION_E, POSITION = _state(3)  # m, of the IMU, earth-fixed axes
+VELOCITY_E, VELOCITY = _state(3)  # m/s, over ground, earth-fixed axes
+QUATERNION_EB, ATTITUDE = _nominal.block(4), _error.block(3)  # body to earth-fixed; rad, e axes: exp([error]x) mat_eb
+GYRO_BIAS_B, GYRO_BIAS = _state(3)  # rad/s
+ACCEL_BIAS_B, ACCEL_BIAS = _state(3)  # m/s^2
+CALIBRATIONS = _error.size  # error states from here on belong to the installation; their nominal states follow one higher
+WHEEL_SCALE, SCALE = _state(1)  # 1: what wheels read too much: those of the first group, which is all by default
+MOUNT, MOUNT_ERROR = _state(2)  # rad: pitch and yaw of the IMU against the vehicle
+ERROR_SIZE = _error.size  # of the ordinary state; what follows is only in a state of WIDE_SIZE
+FURTHER_SCALES, FURTHER_SCALES_ERROR = _state(3)  # 1: what wheels of the second to fourth group read too much
+ANTENNA_B, ANTENNA_ERROR = _state(3)  # m, what the antenna's lever arm is more than configured, b axes
+DELAYS, DELAYS_ERROR = _state(2)  # s, what the position's delay is more than configured, the velocity's more than that
+HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR = _state(1)  # m, what the barometer reads too much
+NOMINAL_SIZE, WIDE_SIZE = _nominal.size, _error.size
+
+# Auxiliary numbers: places in FilterState.auxiliary
+_auxiliary = _Layout()
+HELD_FORCE_B = _auxiliary.block(3)  # m/s^2, the newest inertial sample behind the state
+HELD_RATE_B = _auxiliary.block(3)  # rad/s
+FORCE_B = _auxiliary.block(3)  # m/s^2, interpolated at the state's own instant
+RATE_B = _auxiliary.block(3)  # rad/s
+MEAN_FORCE_B = _auxiliary.block(3)  # m/s^2, exponential means and variances for leveling and for the motion detector
+MEAN_RATE_B = _auxiliary.block(3)  # rad/s
+SCATTER_FORCE = _auxiliary.one()  # (m/s^2)^2
+SCATTER_RATE = _auxiliary.one()  # (rad/s)^2
+MEAN_WEIGHT = _auxiliary.one()  # 1: how much of the mean is filled, in 0..1
+REST_RATE_B = _auxiliary.block(3)  # rad/s, mean gyro of the last standstill before the start
+FIRST_VELOCITY_N = _auxiliary.block(3)  # m/s, GNSS velocity at the begin of the alignment window
+FIX_E = _auxiliary.block(3)  # m, last GNSS antenna position before the start
+FIX_VARIANCE = _auxiliary.block(2)  # m^2, horizontal, vertical
+CONSTRAINT_RATIO = _auxiliary.block(3)  # last test ratios: non-holonomic, zero velocity, zero rotation
+RATE_VARIANCE = _auxiliary.one()  # (rad/s)^2, white noise of RATE_B, per axis
+SMOOTH_FORCE_B = _auxiliary.block(3)  # m/s^2, mean over the delays of receivers
+AUXILIARY_SIZE = _auxiliary.size
 
 # Remembered of each source: columns of FilterState.memory
-LAST_SPEED = 0  # m/s, last reading of a wheel; of a GNSS velocity, the lowest horizontal speed that it leaves possible
-LAST_RATIO = 1  # test ratio of the last update
-NOISE_EXCESS = 2  # learnt variance over the configured one, less 1
-BELIEF = slice(3, 7)  # probabilities (fusiond.filter.source_health); all 0 before the first look
-NOMINAL, NOISY, BIASED, FROZEN = 3, 4, 5, 6
-BIAS = slice(7, 10)  # whitened innovation that a biased source would have
-BIAS_VARIANCE = 10
-LAST_SUM = 11  # of the last reading's numbers: tells a repeated one
-INTERVAL = 12  # s, mean spacing of the events
-LAST_INNOVATION = slice(13, 16)  # of the last rejection
-MEAN_NIS = 16  # normalised innovation squared per axis, mean
-MEMORY_SIZE = 17
+_memory = _Layout()
+LAST_SPEED = _memory.one()  # m/s, last reading of a wheel
+LOWEST_SPEED = _memory.one()  # m/s, lowest horizontal speed that the last GNSS velocity leaves possible
+LAST_RATIO = _memory.one()  # test ratio of the last update
+NOISE_EXCESS = _memory.one()  # learnt variance over the configured one, less 1
+BELIEF = _memory.block(4)  # probabilities (fusiond.filter.source_health); all 0 before the first look
+NOMINAL, NOISY, BIASED, FROZEN = range(BELIEF.start, BELIEF.stop)
+BIAS = _memory.block(3)  # whitened innovation that a biased source would have
+BIAS_VARIANCE = _memory.one()
+LAST_SUM = _memory.one()  # of the last reading's numbers: shows a repeated one
+INTERVAL = _memory.one()  # s, mean spacing of the events
+LAST_INNOVATION = _memory.block(3)  # of the last rejection
+MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
+MEMORY_SIZE = _memory.size
 
-# Stamps and counts: indices of FilterState.stamps
-T = 0  # ns, instant of the state
-T_IMU = 1  # ns, of the held inertial sample
-T_CONSTRAINT = 2  # ns, of the last round of motion constraints
-T_STILL = 3  # ns, since when the vehicle stands; NEVER if it does not
-T_POSITION = 4  # ns, of the last position fused
-T_FIRST_VELOCITY = 5  # ns, begin of the alignment window
-T_FIX = 6  # ns, of FIX_E
-T_REST = 7  # ns, end of the standstill that REST_RATE_B is the mean of
-T_START = 8  # ns, when the filter began to run
-PHASE = 9  # EMPTY, ALIGNING, RUNNING, CHOOSING
-RESETS = 10  # count of jumps of the state
-CONSTRAINT_FUSED = slice(11, 14)  # counts: non-holonomic, zero velocity, zero rotation
-CONSTRAINT_REJECTED = slice(14, 17)
-BLOWN = 17  # count of restarts because the state was no longer finite
-RESET_REASON = 18  # of the last jump: ResetReason
-RESET_SOURCE = 19  # index of the source behind it, where there is one
-HOT_START = 20  # what became of the stored state: Verdict
-STAMPS_SIZE = 21
+# Stamps and counts: places in FilterState.stamps
+_stamps = _Layout()
+T = _stamps.one()  # ns, instant of the state
+T_IMU = _stamps.one()  # ns, of the held inertial sample
+T_CONSTRAINT = _stamps.one()  # ns, of the last round of motion constraints
+T_STILL = _stamps.one()  # ns, since when the vehicle stands; NEVER if it does not
+T_POSITION = _stamps.one()  # ns, of the last position fused
+T_FIRST_VELOCITY = _stamps.one()  # ns, begin of the alignment window
+T_FIX = _stamps.one()  # ns, of FIX_E
+T_REST = _stamps.one()  # ns, end of the standstill that REST_RATE_B is the mean of
+T_START = _stamps.one()  # ns, when the filter began to run
+PHASE = _stamps.one()  # EMPTY, ALIGNING, RUNNING, CHOOSING; from here on 0 in an empty state
+RESETS = _stamps.one()  # count of jumps of the state
+CONSTRAINT_FUSED = _stamps.block(3)  # counts: non-holonomic, zero velocity, zero rotation
+CONSTRAINT_REJECTED = _stamps.block(3)
+BLOWN = _stamps.one()  # count of restarts because the state was no longer finite
+RESET_REASON = _stamps.one()  # of the last jump: ResetReason
+RESET_SOURCE = _stamps.one()  # index of the source behind it, where there is one
+HOT_START = _stamps.one()  # what became of the stored state: Verdict
+STAMPS_SIZE = _stamps.size
 
 # And of each source: columns of FilterState.source_stamps
-T_LAST = 0  # ns, of its last event
-T_FUSED = 1  # ns, of its last event fused
-T_REJECTED = 2  # ns, of the first of an unbroken row of rejections; NEVER if there is none
-T_JUDGED = 3  # ns, of the last look at its health
-T_ALIKE = 4  # ns, since when its rejected readings are off alike; NEVER if there is none
-T_BACK = 5  # ns, since when it is heard again after an outage, or for the first time
-SOURCE_STAMPS_SIZE = 6
+_source_stamps = _Layout()
+T_LAST = _source_stamps.one()  # ns, of its last event
+T_FUSED = _source_stamps.one()  # ns, of its last event fused
+T_REJECTED = _source_stamps.one()  # ns, of the first of an unbroken run of rejections; NEVER if there is none
+T_JUDGED = _source_stamps.one()  # ns, of the last look at its health
+T_ALIKE = _source_stamps.one()  # ns, since when its rejected readings have the same error; NEVER if there is none
+T_BACK = _source_stamps.one()  # ns, since when it is heard again after an outage, or for the first time
+SOURCE_STAMPS_SIZE = _source_stamps.size
 
 EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
 HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.filter.heading_bank): twelve all round, and a stored one

@@ -3,6 +3,16 @@
 
 cdef double[4] PRIOR = [0.997, 0.001, 0.001, 0.001]
 
+# ---------------- fusiond.maths.linear
+
+cdef double linear_dot(double* a, double* b) noexcept nogil:
+    cdef double total
+    cdef int64_t k
+    total = 0.0
+    for k in range(n):
+        total += (a[k] * b[k])
+    return total
+
 # ---------------- fusiond.maths.portable
 
 cdef double portable_square(double x) noexcept nogil:
@@ -103,16 +113,6 @@ cdef double portable_exp(double x) noexcept nogil:
     c = (r - (t * (0.16666666666666602 + (t * ((-0.0027777777777015593) + (t * (6.613756321437934e-05 + (t * ((-1.6533902205465252e-06) + (t * 4.1381367970572385e-08))))))))))
     y = (1.0 - ((low - ((r * c) / (2.0 - c))) - high))
     return ldexp(y, (<int64_t>k))
-
-# ---------------- fusiond.maths.linear
-
-cdef double linear_dot(double* a, double* b) noexcept nogil:
-    cdef double total
-    cdef int64_t k
-    total = 0.0
-    for k in range(n):
-        total += (a[k] * b[k])
-    return total
 
 # ---------------- fusiond.maths.rotation
 
@@ -375,6 +375,1939 @@ cdef void wgs84_gravity_e(double* position_e, double* out) noexcept nogil:
     out[1] = (((-g) * cos_lat) * sin_lon)
     out[2] = ((-g) * sin_lat)
     return
+
+# ---------------- fusiond.filter.heading_bank
+
+cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double factor, double* spread) noexcept nogil:
+    cdef int64_t m
+    cdef double lower[3 * 3]
+    cdef double widened[3]
+    cdef double whitened[3]
+    cdef int64_t a
+    cdef double square
+    cdef double size
+    cdef double lowest
+    cdef int64_t _a
+    m = seen.m
+    for a in range(m):
+        widened[a] = (factor * seen.variance[a])
+    if ((not measurement_update_cholesky(spread, widened, 1.0, m, lower)) or (not measurement_update_whiten(spread, seen.innovation, widened, m, whitened))):
+        return
+    square, size = 0.0, 1.0
+    for a in range(m):
+        square += (whitened[a] * whitened[a])
+        size *= lower[(a) * 3 + a]
+    lowest = portable_exp(((-(1000.0 if 1000.0 < square else square)) / (2 * 100.0)))
+    for _a in range(m):
+        lowest /= sqrt(100.0)
+    state.bank[(i) * BLOCK + 0] *= ((((1 - 0.01) * portable_exp(((-square) / 2))) + (0.01 * lowest)) / size)
+
+cdef void heading_bank_take(State* state, int64_t i, State* hypothesis, Observation* seen, double factor, Plan* plan, bint weighed) noexcept nogil:
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    measurement_update_project(hypothesis, seen, across, spread)
+    if weighed:
+        heading_bank_weigh(state, i, seen, factor, spread)
+    measurement_update_update_projected(hypothesis, seen, plan.gates[seen.m], factor, True, 0.01, across, spread)
+
+cdef void heading_bank_measure(State* state, int64_t i, int64_t model, double* values, double* parameter, double factor, Plan* plan) noexcept nogil:
+    cdef State hypothesis
+    cdef Observation seen
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    hypothesis = hypothesis_of(state, i)
+    if (model == 2):
+        wheel_speed_observe_certain(&hypothesis, values, parameter, &seen)
+        measurement_share_noise(&hypothesis, &seen, parameter)
+        measurement_update_project(&hypothesis, &seen, across, spread)
+        heading_bank_weigh(state, i, &seen, factor, spread)
+    if observations_observe(&hypothesis, model, values, parameter, &seen):
+        measurement_share_noise(&hypothesis, &seen, parameter)
+        heading_bank_take(state, i, &hypothesis, &seen, factor, plan, (model != 2))
+
+cdef void heading_bank_constrain(State* state, Plan* plan) noexcept nogil:
+    cdef (bint, bint) _t1
+    cdef bint still
+    cdef bint rolling
+    cdef Observation seen
+    cdef int64_t i
+    cdef State hypothesis
+    _t1 = motion_constraints_constraints_due(state, plan)
+    still = _t1[0]
+    rolling = _t1[1]
+    if (not (still or rolling)):
+        return
+    for i in range(13):
+        if (still and (state.bank[(i) * BLOCK + 0] > 0)):
+            hypothesis = hypothesis_of(state, i)
+            motion_constraints_observe_constraint(&hypothesis, 1, plan, &seen)
+            model_with_rate_noise(&hypothesis, &seen)
+            heading_bank_take(state, i, &hypothesis, &seen, plan.zero_velocity_factor, plan, True)
+            motion_constraints_observe_constraint(&hypothesis, 2, plan, &seen)
+            model_with_rate_noise(&hypothesis, &seen)
+            heading_bank_take(state, i, &hypothesis, &seen, 1.0, plan, True)
+    if (rolling and (not still)):
+        heading_bank__roll(state, plan)
+    heading_bank_normalise(state)
+
+cdef void heading_bank__roll(State* state, Plan* plan) noexcept nogil:
+    cdef double* parameter
+    cdef Observation seen
+    cdef double fastest
+    cdef int64_t i
+    cdef State hypothesis
+    cdef double _t1
+    parameter = plan.constraints + (0) * PARAMETERS
+    fastest = 0.0
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, i)
+            _t1 = non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
+            fastest = (_t1 if _t1 > fastest else fastest)
+    if (fastest < parameter[5]):
+        return
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, i)
+            non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
+            model_with_rate_noise(&hypothesis, &seen)
+            heading_bank_take(state, i, &hypothesis, &seen, 1.0, plan, True)
+
+cdef void heading_bank_normalise(State* state) noexcept nogil:
+    cdef double total
+    cdef int64_t i
+    total = 0.0
+    for i in range(13):
+        total += state.bank[(i) * BLOCK + 0]
+    for i in range(13):
+        state.bank[(i) * BLOCK + 0] = ((state.bank[(i) * BLOCK + 0] / total) if (total > 0) else 0.0)
+        if (state.bank[(i) * BLOCK + 0] < 1e-09):
+            state.bank[(i) * BLOCK + 0] = 0.0
+
+cdef void heading_bank_settle(State* state, Plan* plan) noexcept nogil:
+    cdef int64_t best
+    cdef int64_t i
+    cdef State likeliest
+    cdef double to_n[3 * 3]
+    cdef double* down
+    cdef double errors[13 * n]
+    cdef double turns[13]
+    cdef double _t1
+    cdef double mean
+    cdef double spread
+    cdef double doubt
+    cdef State hypothesis
+    cdef double _t2[n]
+    cdef int _i
+    cdef double* turn
+    cdef double own
+    heading_bank_normalise(state)
+    best = (-1)
+    for i in range(13):
+        if ((state.bank[(i) * BLOCK + 0] > 0) and ((best < 0) or (state.bank[(i) * BLOCK + 0] > state.bank[(best) * BLOCK + 0]))):
+            best = i
+    if (best < 0):
+        return
+    likeliest = hypothesis_of(state, best)
+    wgs84_mat_ne(likeliest.nominal, to_n)
+    down = to_n + (2) * 3
+    memset(errors, 0, 13 * n * sizeof(double))
+    memset(turns, 0, 13 * sizeof(double))
+    _t1 = 0.0
+    mean = _t1
+    spread = _t1
+    doubt = _t1
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, i)
+            measurement_update_difference(&hypothesis, &likeliest, _t2)
+            for _i in range(n):
+                (errors + (i) * n)[_i] = _t2[_i]
+            turn = errors + (i) * n + 6
+            turns[i] = (((down[0] * turn[0]) + (down[1] * turn[1])) + (down[2] * turn[2]))
+            mean += (state.bank[(i) * BLOCK + 0] * turns[i])
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, i)
+            own = heading_bank__variance_along(&hypothesis, down[0], down[1], down[2])
+            spread += (state.bank[(i) * BLOCK + 0] * (own + ((turns[i] - mean) * (turns[i] - mean))))
+            if (fabs(turns[i]) > 0.5235987755982988):
+                doubt += state.bank[(i) * BLOCK + 0]
+    if ((spread <= plan.heading_variance) and (doubt <= 0.0001)):
+        heading_bank__collapse(state, best, errors)
+
+cdef double heading_bank__variance_along(State* hypothesis, double x, double y, double z) noexcept nogil:
+    cdef double* p
+    cdef int64_t phi
+    cdef double turned[3]
+    cdef int64_t a
+    p = hypothesis.covariance
+    phi = 6
+    for a in range(3):
+        turned[a] = (((p[((phi + a)) * n + phi] * x) + (p[((phi + a)) * n + (phi + 1)] * y)) + (p[((phi + a)) * n + (phi + 2)] * z))
+    return (((x * turned[0]) + (y * turned[1])) + (z * turned[2]))
+
+cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noexcept nogil:
+    cdef double* p
+    cdef double mean[n]
+    cdef int64_t i
+    cdef int _i
+    cdef double weight
+    cdef State hypothesis
+    cdef int64_t j
+    cdef double _t1
+    cdef double _t2
+    cdef State likeliest
+    cdef int64_t source
+    p = state.covariance
+    memset(mean, 0, n * sizeof(double))
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            axpy(mean, state.bank[(i) * BLOCK + 0], errors + (i) * n)
+    for _i in range(n * n):
+        p[_i] = 0.0
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            weight = state.bank[(i) * BLOCK + 0]
+            hypothesis = hypothesis_of(state, i)
+            for j in range(n):
+                _t1 = (errors[(i) * n + j] - mean[j])
+                _t2 = (errors[(i) * n + j] - mean[j])
+                for _i in range(n):
+                    (p + (j) * n)[_i] += (weight * ((hypothesis.covariance + (j) * n)[_i] + (_t2 * ((errors + (i) * n)[_i] - mean[_i]))))
+    linear_mirror(p)
+    likeliest = hypothesis_of(state, best)
+    for _i in range(NOMINAL_SIZE):
+        state.nominal[_i] = likeliest.nominal[_i]
+    measurement_update_inject(state, mean)
+    for _i in range(HYPOTHESES * BLOCK):
+        state.bank[_i] = 0.0
+    state.stamps[9] = 2
+    if (state.stamps[20] == 1):
+        state.stamps[10] += 1
+        state.stamps[18] = 5
+    for source in range(state.sources):
+        state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
+
+# ---------------- fusiond.filter.initial_alignment
+
+cdef void initial_alignment_gather_motion(State* state, Row* row, Plan* plan) noexcept nogil:
+    cdef int64_t* stamps
+    cdef double* a
+    cdef double* values
+    cdef int64_t t_ns
+    cdef int64_t source
+    cdef int64_t i
+    cdef double _t1
+    cdef double _t2
+    cdef bint still
+    cdef int _i
+    stamps = state.stamps
+    a = state.auxiliary
+    values = row.values
+    t_ns, source = (<int64_t>row.t_ns), (<int64_t>row.source)
+    stamps[0] = t_ns
+    if (plan.models[source] == 2):
+        state.memory[(source) * MEMORY_SIZE + 0] = values[0]
+    if (plan.models[source] != -1):
+        return
+    source_health_arrive(state.memory + (source) * MEMORY_SIZE, state.source_stamps + (source) * SOURCE_STAMPS_SIZE, values, t_ns)
+    if (stamps[1] != (<int64_t>-4611686018427387904)):
+        motion_constraints_watch(state, values, values + 3, ((t_ns - stamps[1]) * 1e-09), plan)
+    stamps[1] = t_ns
+    for i in range(3):
+        _t1 = values[i]
+        a[(0 + i)] = _t1
+        a[(6 + i)] = _t1
+        _t2 = values[(3 + i)]
+        a[(3 + i)] = _t2
+        a[(9 + i)] = _t2
+    still = ((stamps[3] != (<int64_t>-4611686018427387904)) and ((t_ns - stamps[3]) >= plan.still_after_ns))
+    if (still and (not (initial_alignment__gnss_speed(state) >= plan.course_speed))):
+        for _i in range(3):
+            (a + 21)[_i] = (a + 15)[_i]
+        stamps[7] = t_ns
+
+cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
+    cdef int64_t first
+    cdef double north
+    cdef double east
+    first = state.stamps[5]
+    if ((first == (<int64_t>-4611686018427387904)) or ((state.stamps[0] - first) > (<int64_t>3000000000))):
+        return NAN
+    north, east = state.auxiliary[24], state.auxiliary[(24 + 1)]
+    return sqrt((portable_square(north) + portable_square(east)))
+
+# ---------------- fusiond.filter.measurement
+
+cdef void measurement_share_noise(State* state, Observation* seen, double* parameter) noexcept nogil:
+    cdef int64_t a
+    for a in range(seen.m):
+        seen.variance[a] *= parameter[10]
+    model_with_rate_noise(state, seen)
+
+cdef void measurement_remember(double* memory, int64_t model, double* values) noexcept nogil:
+    if (model == 2):
+        memory[0] = values[0]
+    elif (model == 1):
+        memory[1] = gnss_velocity_lowest_speed(values)
+
+cdef double measurement_factor_of(int64_t* stamps, int64_t model, double* values, double* parameter, int64_t t_ns) noexcept nogil:
+    if (stamps[1] == (<int64_t>-4611686018427387904)):
+        return 1.0
+    return measurement_update_correlation_factor(((t_ns - stamps[1]) * 1e-09), measurement_correlation_of(model, values, parameter))
+
+cdef double measurement_correlation_of(int64_t model, double* values, double* parameter) noexcept nogil:
+    return (values[2] if (model == 2) else parameter[3])
+
+cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil:
+    cdef int64_t source
+    cdef int64_t t_ns
+    cdef int64_t model
+    cdef double* values
+    cdef double* parameter
+    cdef double* memory
+    cdef int64_t* stamps
+    cdef double elapsed
+    cdef bint same
+    cdef Observation seen
+    cdef int64_t m
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    cdef double given[3]
+    cdef double learnt[3]
+    cdef double factor
+    cdef int64_t a
+    cdef double weight
+    cdef int64_t companion
+    cdef bint doubtful
+    cdef double whitened[3]
+    cdef bint known
+    cdef bint trusted
+    cdef double noisy
+    cdef (double, bint) _t1
+    cdef double ratio
+    cdef bint fused
+    cdef double _t2
+    cdef int64_t _t3
+    source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
+    model = plan.models[source]
+    values = row.values
+    parameter = plan.parameters + (source) * PARAMETERS
+    memory = state.memory + (source) * MEMORY_SIZE
+    stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
+    elapsed = source_health_since_last(stamps, t_ns)
+    same = source_health_arrive(memory, stamps, values, t_ns)
+    measurement_remember(memory, model, values)
+    if (not observations_observe(state, model, values, parameter, &seen)):
+        return False
+    m = seen.m
+    measurement_update_project(state, &seen, across, spread)
+    measurement_share_noise(state, &seen, parameter)
+    factor = source_health_noise_factor(memory, parameter[8], parameter[9])
+    for a in range(m):
+        given[a] = seen.variance[a]
+        learnt[a] = (given[a] * factor)
+        row.innovation[a] = seen.innovation[a]
+        row.variance[a] = (spread[(a) * 3 + a] + learnt[a])
+    weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
+    if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
+        stamps[1] = (<int64_t>-4611686018427387904)
+        stamps[5] = t_ns
+        source_health_begin(memory)
+    companion = (<int64_t>(parameter[11]))
+    doubtful = motion_constraints_disputed(state, (source if (model == 1) else companion), plan)
+    if (not doubtful):
+        if source_health_is_due(stamps, t_ns, measurement_correlation_of(model, values, parameter)):
+            known = ((stamps[1] != (<int64_t>-4611686018427387904)) and source_health_observes_sensor(spread, learnt, m))
+            if (known and measurement_update_whiten(spread, seen.innovation, learnt, m, whitened)):
+                source_health_judge(memory, stamps, whitened, m, same, t_ns)
+        source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
+    trusted = (source_health_is_trusted(memory) and ((companion < 0) or source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))
+    if ((model == 2) and trusted):
+        trusted = (not motion_constraints_carried(state, memory[0], plan))
+    noisy = source_health_noisy_factor(memory)
+    for a in range(m):
+        seen.variance[a] = (learnt[a] * noisy)
+    _t1 = measurement_update_update_projected(state, &seen, plan.gates[m], weight, trusted, parameter[12], across, spread)
+    ratio = _t1[0]
+    fused = _t1[1]
+    _t2 = ratio
+    row.ratio = _t2
+    memory[2] = _t2
+    if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, plan)):
+        measurement__reset(state, source, &seen, (<int64_t>(parameter[13])))
+        source_health_begin(memory)
+        fused = True
+    if fused:
+        _t3 = (<int64_t>-4611686018427387904)
+        stamps[2] = _t3
+        stamps[4] = _t3
+        stamps[1] = t_ns
+        if (model == 0):
+            state.stamps[4] = t_ns
+    elif (stamps[2] == (<int64_t>-4611686018427387904)):
+        stamps[2] = t_ns
+    return fused
+
+cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Plan* plan) noexcept nogil:
+    cdef double* memory
+    cdef int64_t* stamps
+    cdef bint off
+    cdef int64_t wait
+    cdef int64_t companion
+    cdef bint returns
+    memory = state.memory + (source) * MEMORY_SIZE
+    stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
+    off = source_health_moved(memory, seen.innovation, seen.variance, seen.m, plan.gates[seen.m])
+    if (off or (stamps[4] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>5000000000))):
+        stamps[4] = t_ns
+        return False
+    wait = plan.gnss_reset_ns
+    companion = (<int64_t>(plan.parameters[(source) * PARAMETERS + 11]))
+    returns = ((stamps[1] == (<int64_t>-4611686018427387904)) or ((stamps[4] - stamps[5]) <= (<int64_t>10000000000)))
+    if ((returns and (memory[2] <= 9.0)) or motion_constraints_is_carried(state, plan)):
+        wait = plan.gnss_return_ns
+    elif ((plan.models[source] == 1) or ((companion >= 0) and (not source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))):
+        wait = (6 * wait)
+    return ((t_ns - stamps[4]) >= wait)
+
+cdef void measurement__reset(State* state, int64_t source, Observation* seen, int64_t block) noexcept nogil:
+    if (block == 26):
+        measurement__reset_offset(state, seen)
+        return
+    measurement__reset_block(state, seen, block)
+    state.stamps[10] += 1
+    state.stamps[18] = 4
+    state.stamps[19] = source
+
+cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef int64_t m
+    cdef double to_n[3 * 3]
+    cdef double half[3 * 3]
+    cdef double spread[3 * 3]
+    cdef int64_t i
+    cdef int64_t k
+    cdef int64_t j
+    cdef int _i
+    x = state.nominal
+    p = state.covariance
+    m = seen.m
+    wgs84_mat_ne(x, to_n)
+    memset(half, 0, 3 * 3 * sizeof(double))
+    memset(spread, 0, 3 * 3 * sizeof(double))
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                half[(i) * 3 + j] += (to_n[(i) * 3 + k] * p[((block + k)) * n + (block + j)])
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                spread[(i) * 3 + j] += (half[(i) * 3 + k] * to_n[(j) * 3 + k])
+    for i in range(3):
+        for j in range(3):
+            if ((i < m) or (j < m)):
+                spread[(i) * 3 + j] = (seen.variance[i] if (i == j) else 0.0)
+    for i in range(3):
+        for k in range(m):
+            x[(block + i)] += (to_n[(k) * 3 + i] * seen.innovation[k])
+        for _i in range(n):
+            (p + ((block + i)) * n)[_i] = 0.0
+        for _i in range(n):
+            (p + (block + i))[_i * n] = 0.0
+        for _i in range(3):
+            (half + (i) * 3)[_i] = 0.0
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                half[(i) * 3 + j] += (to_n[(k) * 3 + i] * spread[(k) * 3 + j])
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                p[((block + i)) * n + (block + j)] += (half[(i) * 3 + k] * to_n[(k) * 3 + j])
+
+cdef void measurement__reset_offset(State* state, Observation* seen) noexcept nogil:
+    cdef double* p
+    cdef int64_t offset
+    cdef int _i
+    cdef double cross[n]
+    cdef int64_t k
+    cdef double variance
+    p = state.covariance
+    offset = 26
+    state.nominal[27] += seen.innovation[0]
+    for _i in range(n):
+        (p + (offset) * n)[_i] = 0.0
+    for _i in range(n):
+        (p + offset)[_i * n] = 0.0
+    memset(cross, 0, n * sizeof(double))
+    for k in range(n):
+        if (seen.jacobian[(0) * n + k] != 0.0):
+            axpy(cross, (-seen.jacobian[(0) * n + k]), p + (k) * n)
+    for _i in range(n):
+        (p + (offset) * n)[_i] = cross[_i]
+    for _i in range(n):
+        (p + offset)[_i * n] = cross[_i]
+    variance = seen.variance[0]
+    for k in range(n):
+        variance += (-(cross[k] * seen.jacobian[(0) * n + k]))
+    p[(offset) * n + offset] = variance
+
+# ---------------- fusiond.filter.measurement_update
+
+cdef double measurement_update_correlation_factor(double interval, double correlation) noexcept nogil:
+    cdef double _t1
+    cdef double same
+    if ((not (correlation > 0)) or (interval == INFINITY)):
+        return 1.0
+    _t1 = 1e-06
+    same = portable_exp(((-(_t1 if _t1 > interval else interval)) / correlation))
+    if (same < 1):
+        return ((1 + same) / (1 - same))
+    return INFINITY
+
+cdef bint measurement_update_cholesky(double* spread, double* variance, double factor, int64_t m, double* lower) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t j
+    cdef double rest
+    cdef int64_t k
+    for i in range(m):
+        for j in range((i + 1)):
+            rest = spread[(i) * 3 + j]
+            if (i == j):
+                rest += (factor * variance[i])
+            for k in range(j):
+                rest -= (lower[(i) * 3 + k] * lower[(j) * 3 + k])
+            if (i == j):
+                if (not ((variance[i] >= 0) and (0 < rest < INFINITY))):
+                    return False
+                lower[(i) * 3 + i] = sqrt(rest)
+            else:
+                lower[(i) * 3 + j] = (rest / lower[(j) * 3 + j])
+    return True
+
+cdef void measurement_update_project(State* state, Observation* seen, double* across, double* spread) noexcept nogil:
+    cdef int64_t a
+    cdef int _i
+    cdef int64_t k
+    cdef int64_t i
+    cdef double _t1
+    for a in range(seen.m):
+        for _i in range(n):
+            (across + (a) * n)[_i] = 0.0
+        for k in range(n):
+            if (seen.jacobian[(a) * n + k] != 0.0):
+                axpy(across + (a) * n, seen.jacobian[(a) * n + k], state.covariance + (k) * n)
+    for a in range(seen.m):
+        for i in range((a + 1)):
+            _t1 = linear_dot(seen.jacobian + (a) * n, across + (i) * n)
+            spread[(a) * 3 + i] = _t1
+            spread[(i) * 3 + a] = _t1
+
+cdef bint measurement_update_whiten(double* spread, double* innovation, double* variance, int64_t m, double* whitened) noexcept nogil:
+    cdef double lower[3 * 3]
+    cdef int64_t i
+    cdef double rest
+    cdef int64_t k
+    if (not measurement_update_cholesky(spread, variance, 1.0, m, lower)):
+        return False
+    for i in range(m):
+        rest = innovation[i]
+        for k in range(i):
+            rest -= (lower[(i) * 3 + k] * whitened[k])
+        whitened[i] = (rest / lower[(i) * 3 + i])
+    return True
+
+cdef (double, bint) measurement_update_update(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter) noexcept nogil:
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    measurement_update_project(state, seen, across, spread)
+    return measurement_update_update_projected(state, seen, gate, factor, trusted, clutter, across, spread)
+
+cdef (double, bint) measurement_update_update_projected(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, double* across, double* spread) noexcept nogil:
+    cdef int64_t m
+    cdef double* p
+    cdef double whitened[3]
+    cdef double distance
+    cdef int64_t a
+    cdef double ratio
+    cdef double share
+    cdef double lower[3 * 3]
+    cdef double before[n * n]
+    cdef int64_t i
+    cdef int _i
+    cdef double gain[3 * n]
+    cdef double error[n]
+    cdef double mixed
+    cdef double _t1
+    cdef double _t2
+    m = seen.m
+    p = state.covariance
+    if (not measurement_update_whiten(spread, seen.innovation, seen.variance, m, whitened)):
+        return (INFINITY, False)
+    distance = 0.0
+    for a in range(m):
+        distance += (whitened[a] * whitened[a])
+    ratio = (distance / gate)
+    if (not (ratio < INFINITY)):
+        return (INFINITY, False)
+    if ((not trusted) or ((clutter == 0) and (not (ratio <= 1)))):
+        return (ratio, False)
+    share = 1.0
+    if (clutter != 0):
+        share = measurement_update_detection(distance, m, clutter)
+        if (share < 1e-06):
+            return (ratio, False)
+    if (not measurement_update_cholesky(spread, seen.variance, factor, m, lower)):
+        return (ratio, False)
+    if (share < 1):
+        for i in range(n):
+            for _i in range(n):
+                (before + (i) * n)[_i] = (p + (i) * n)[_i]
+    measurement_update__solve(lower, across, m, gain)
+    measurement_update__joseph(p, seen, factor, across, gain)
+    memset(error, 0, n * sizeof(double))
+    for a in range(m):
+        axpy(error, seen.innovation[a], gain + (a) * n)
+    if (share < 1):
+        mixed = (share * (1 - share))
+        for i in range(n):
+            _t1 = (1 - share)
+            _t2 = error[i]
+            for _i in range(n):
+                (p + (i) * n)[_i] = (((share * (p + (i) * n)[_i]) + (_t1 * (before + (i) * n)[_i])) + (mixed * (_t2 * error[_i])))
+        for _i in range(n):
+            error[_i] *= share
+    measurement_update_turn_along(p, error)
+    measurement_update_inject(state, error)
+    return (ratio, (share >= 0.5))
+
+cdef void measurement_update__solve(double* lower, double* across, int64_t m, double* gain) noexcept nogil:
+    cdef int64_t i
+    cdef int _i
+    cdef int64_t k
+    cdef double _t1
+    cdef double _t2
+    for i in range(m):
+        for _i in range(n):
+            (gain + (i) * n)[_i] = (across + (i) * n)[_i]
+        for k in range(i):
+            axpy(gain + (i) * n, (-lower[(i) * 3 + k]), gain + (k) * n)
+        _t1 = lower[(i) * 3 + i]
+        for _i in range(n):
+            (gain + (i) * n)[_i] /= _t1
+    for i in range((m - 1), (-1), (-1)):
+        for k in range((i + 1), m):
+            axpy(gain + (i) * n, (-lower[(k) * 3 + i]), gain + (k) * n)
+        _t2 = lower[(i) * 3 + i]
+        for _i in range(n):
+            (gain + (i) * n)[_i] /= _t2
+
+cdef void measurement_update__joseph(double* p, Observation* seen, double factor, double* across, double* gain) noexcept nogil:
+    cdef int64_t a
+    cdef int _i
+    cdef double kept[3 * n]
+    cdef int64_t k
+    for a in range(seen.m):
+        for _i in range(n):
+            axpy(p + _i * n, (-(across + (a) * n)[_i]), gain + (a) * n)
+    memset(kept, 0, 3 * n * sizeof(double))
+    for a in range(seen.m):
+        for k in range(n):
+            if (seen.jacobian[(a) * n + k] != 0.0):
+                axpy(kept + (a) * n, (-seen.jacobian[(a) * n + k]), p + (k) * n)
+    for a in range(seen.m):
+        axpy(kept + (a) * n, (factor * seen.variance[a]), gain + (a) * n)
+    for a in range(seen.m):
+        for _i in range(n):
+            axpy(p + _i * n, (gain + (a) * n)[_i], kept + (a) * n)
+    linear_mirror(p)
+
+cdef void measurement_update_turn_along(double* p, double* error) noexcept nogil:
+    cdef double turned[6 * n]
+    cdef int64_t phi
+    cdef int64_t block
+    cdef double _t1
+    cdef double _t2
+    cdef int _i
+    cdef double _t3
+    cdef double _t4
+    cdef double _t5
+    cdef double _t6
+    cdef int64_t i
+    cdef double x
+    cdef double y
+    cdef double z
+    phi = 6
+    for block in range(0, 6, 3):
+        _t1 = error[(block + 1)]
+        _t2 = error[(block + 2)]
+        for _i in range(n):
+            (turned + (block) * n)[_i] = ((_t1 * (p + ((phi + 2)) * n)[_i]) - (_t2 * (p + ((phi + 1)) * n)[_i]))
+        _t3 = error[(block + 2)]
+        _t4 = error[block]
+        for _i in range(n):
+            (turned + ((block + 1)) * n)[_i] = ((_t3 * (p + (phi) * n)[_i]) - (_t4 * (p + ((phi + 2)) * n)[_i]))
+        _t5 = error[block]
+        _t6 = error[(block + 1)]
+        for _i in range(n):
+            (turned + ((block + 2)) * n)[_i] = ((_t5 * (p + ((phi + 1)) * n)[_i]) - (_t6 * (p + (phi) * n)[_i]))
+    for i in range(6):
+        axpy(p + (i) * n, (-1.0), turned + (i) * n)
+    for block in range(0, 6, 3):
+        for i in range(6):
+            x, y, z = p[(i) * n + phi], p[(i) * n + (phi + 1)], p[(i) * n + (phi + 2)]
+            p[(i) * n + block] -= ((error[(block + 1)] * z) - (error[(block + 2)] * y))
+            p[(i) * n + (block + 1)] -= ((error[(block + 2)] * x) - (error[block] * z))
+            p[(i) * n + (block + 2)] -= ((error[block] * y) - (error[(block + 1)] * x))
+    for i in range(6):
+        for _i in range((n - i)):
+            (p + i + (i) * n)[_i * n] = (p + (i) * n + i)[_i]
+
+cdef double measurement_update_detection(double distance, int64_t m, double clutter) noexcept nogil:
+    cdef double density
+    cdef double uniform
+    cdef int64_t _a
+    density, uniform = ((1 - clutter) * portable_exp(((-distance) / 2))), clutter
+    for _a in range(m):
+        uniform *= 0.025066282746310002
+    return (density / (density + uniform))
+
+cdef void measurement_update_inject(State* state, double* error) noexcept nogil:
+    cdef double* x
+    cdef int _i
+    cdef int64_t i
+    cdef double _t1[4]
+    cdef double _t2[4]
+    cdef double _t3[4]
+    x = state.nominal
+    for _i in range(3):
+        x[_i] += error[_i]
+    for _i in range(3):
+        (x + 3)[_i] += (error + 3)[_i]
+    for _i in range(3):
+        (x + 10)[_i] += (error + 9)[_i]
+    for _i in range(3):
+        (x + 13)[_i] += (error + 12)[_i]
+    for i in range(15, n):
+        x[(i + 1)] += error[i]
+    rotation_quaternion_exp(error + 6, _t3)
+    rotation_quaternion_multiply(_t3, x + 6, _t2)
+    rotation_normalised(_t2, _t1)
+    for _i in range(4):
+        (x + 6)[_i] = _t1[_i]
+
+cdef void measurement_update_difference(State* one, State* other, double* out) noexcept nogil:
+    cdef double* a
+    cdef double* b
+    cdef double error[n]
+    cdef int _i
+    cdef int64_t i
+    cdef int64_t q
+    cdef double back[4]
+    cdef double turn[4]
+    cdef double twice
+    a = one.nominal
+    b = other.nominal
+    for _i in range(3):
+        error[_i] = (a[_i] - b[_i])
+    for _i in range(3):
+        (error + 3)[_i] = ((a + 3)[_i] - (b + 3)[_i])
+    for _i in range(3):
+        (error + 9)[_i] = ((a + 10)[_i] - (b + 10)[_i])
+    for _i in range(3):
+        (error + 12)[_i] = ((a + 13)[_i] - (b + 13)[_i])
+    for i in range(15, n):
+        error[i] = (a[(i + 1)] - b[(i + 1)])
+    q = 6
+    back[0] = b[q]
+    back[1] = (-b[(q + 1)])
+    back[2] = (-b[(q + 2)])
+    back[3] = (-b[(q + 3)])
+    rotation_quaternion_multiply(a + 6, back, turn)
+    twice = (2.0 if (turn[0] >= 0) else (-2.0))
+    for i in range(3):
+        error[(6 + i)] = (turn[(1 + i)] * twice)
+    for _i in range(n):
+        out[_i] = error[_i]
+    return
+
+# ---------------- fusiond.filter.motion_constraints
+
+cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b, double dt, Plan* plan) noexcept nogil:
+    cdef double* auxiliary
+    cdef double smooth
+    cdef int _i
+    cdef double share
+    cdef double weight
+    cdef double step
+    cdef double off[3]
+    auxiliary = state.auxiliary
+    smooth = ((1 - portable_exp(((-dt) / 0.08))) if (auxiliary[20] > 0) else 1.0)
+    for _i in range(3):
+        (auxiliary + 36)[_i] += (smooth * (force_b[_i] - (auxiliary + 36)[_i]))
+    share = (1 - portable_exp(((-dt) / 0.5)))
+    weight = (auxiliary[20] + (share * (1 - auxiliary[20])))
+    auxiliary[20] = weight
+    step = ((share / weight) if (weight > 0) else 1.0)
+    for _i in range(3):
+        off[_i] = (force_b[_i] - (auxiliary + 12)[_i])
+    for _i in range(3):
+        (auxiliary + 12)[_i] += (step * off[_i])
+    auxiliary[18] = motion_constraints__scatter(auxiliary[18], off, step)
+    for _i in range(3):
+        off[_i] = (rate_b[_i] - (auxiliary + 15)[_i])
+    for _i in range(3):
+        (auxiliary + 15)[_i] += (step * off[_i])
+    auxiliary[19] = motion_constraints__scatter(auxiliary[19], off, step)
+    if (not motion_constraints_stands(state, plan)):
+        state.stamps[3] = (<int64_t>-4611686018427387904)
+    elif (state.stamps[3] == (<int64_t>-4611686018427387904)):
+        state.stamps[3] = state.stamps[0]
+
+cdef double motion_constraints__scatter(double before, double* off, double step) noexcept nogil:
+    return ((1 - step) * (before + (step * (((off[0] * off[0]) + (off[1] * off[1])) + (off[2] * off[2])))))
+
+cdef bint motion_constraints_carried(State* state, double wheel_speed, Plan* plan) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t _k1
+    cdef bint fresh
+    if (not (fabs(wheel_speed) <= plan.still_wheel)):
+        return False
+    for _k1 in range(plan.velocities_count):
+        i = plan.velocities[_k1]
+        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 2000000000)
+        if (fresh and (state.memory[(i) * MEMORY_SIZE + 1] > 1.0) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+            return True
+    return False
+
+cdef bint motion_constraints_rests(State* state, Plan* plan) noexcept nogil:
+    cdef bint heard
+    cdef int64_t i
+    cdef int64_t _k1
+    heard = False
+    for _k1 in range(plan.wheels_count):
+        i = plan.wheels[_k1]
+        if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
+            heard = True
+            if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= plan.still_wheel)):
+                return False
+    return heard
+
+cdef bint motion_constraints_is_carried(State* state, Plan* plan) noexcept nogil:
+    return (motion_constraints_rests(state, plan) and motion_constraints_carried(state, 0.0, plan))
+
+cdef bint motion_constraints_disputed(State* state, int64_t velocity, Plan* plan) noexcept nogil:
+    return ((velocity >= 0) and (state.memory[(velocity) * MEMORY_SIZE + 1] > 0.0) and motion_constraints_rests(state, plan))
+
+cdef bint motion_constraints_stands(State* state, Plan* plan) noexcept nogil:
+    cdef double* auxiliary
+    cdef bint wheeled
+    cdef double interval
+    cdef double own
+    cdef double _t1
+    cdef double _t2
+    cdef double _t3
+    cdef double _t4
+    auxiliary = state.auxiliary
+    if ((not plan.standstill) or (auxiliary[20] < 0.8)):
+        return False
+    wheeled = (plan.wheels_count > 0)
+    interval = (state.memory[(plan.imu_source) * MEMORY_SIZE + 13] if wheeled else 0.0)
+    own = ((6.75 / interval) if (interval > 0) else 0.0)
+    _t1 = portable_square(plan.still_accel)
+    _t2 = (own * plan.noise.accel)
+    if (auxiliary[18] > (_t2 if _t2 > _t1 else _t1)):
+        return False
+    _t3 = portable_square(plan.still_gyro)
+    _t4 = (own * plan.noise.gyro)
+    if (auxiliary[19] > (_t4 if _t4 > _t3 else _t3)):
+        return False
+    return (((not wheeled) or motion_constraints_rests(state, plan)) and (not motion_constraints_carried(state, 0.0, plan)))
+
+cdef void motion_constraints_constrain(State* state, Plan* plan) noexcept nogil:
+    cdef (bint, bint) _t1
+    cdef bint still
+    cdef bint rolling
+    _t1 = motion_constraints_constraints_due(state, plan)
+    still = _t1[0]
+    rolling = _t1[1]
+    if (still and motion_constraints__apply(state, 1, plan, plan.zero_velocity_factor)):
+        motion_constraints__apply(state, 2, plan, 1.0)
+    elif rolling:
+        motion_constraints__apply(state, 0, plan, 1.0)
+
+cdef (bint, bint) motion_constraints_constraints_due(State* state, Plan* plan) noexcept nogil:
+    cdef int64_t now
+    cdef bint still
+    now = state.stamps[0]
+    if ((now - state.stamps[2]) < plan.constraint_interval_ns):
+        return (False, False)
+    state.stamps[2] = now
+    still = ((state.stamps[3] != (<int64_t>-4611686018427387904)) and ((now - state.stamps[3]) >= plan.still_after_ns))
+    return (still, (plan.non_holonomic and (not motion_constraints_is_carried(state, plan))))
+
+cdef bint motion_constraints_observe_constraint(State* state, int64_t which, Plan* plan, Observation* seen) noexcept nogil:
+    if (which == 1):
+        return zero_velocity_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
+    if (which == 2):
+        return zero_rotation_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
+    return non_holonomic_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
+
+cdef bint motion_constraints__apply(State* state, int64_t which, Plan* plan, double factor) noexcept nogil:
+    cdef Observation seen
+    cdef (double, bint) _t1
+    cdef double ratio
+    cdef bint fused
+    if (not motion_constraints_observe_constraint(state, which, plan, &seen)):
+        return False
+    model_with_rate_noise(state, &seen)
+    _t1 = measurement_update_update(state, &seen, plan.gates[seen.m], factor, True, 0.0)
+    ratio = _t1[0]
+    fused = _t1[1]
+    state.auxiliary[(32 + which)] = ratio
+    if fused:
+        state.stamps[(11 + which)] += 1
+    else:
+        state.stamps[(14 + which)] += 1
+    return fused
+
+# ---------------- fusiond.filter.north_east_down
+
+cdef void north_east_down_answer(double* nominal, double* covariance, double* out) noexcept nogil:
+    cdef double found[91]
+    cdef double to_n[3 * 3]
+    cdef (double, double, double) _t1
+    cdef double _t2[3]
+    cdef int _i
+    cdef double _t3[4]
+    cdef double _t4[3 * 3]
+    cdef double _t5[3 * 3]
+    cdef double turned[3 * 3]
+    cdef int64_t a
+    cdef int64_t b
+    cdef int64_t i
+    cdef int64_t j
+    wgs84_mat_ne(nominal, to_n)
+    _t1 = wgs84_geodetic(nominal)
+    found[0] = _t1[0]
+    found[1] = _t1[1]
+    found[2] = _t1[2]
+    rotation_times(to_n, nominal + 3, _t2)
+    for _i in range(3):
+        (found + 3)[_i] = _t2[_i]
+    rotation_matrix(nominal + 6, _t5)
+    rotation_matrix_product(to_n, _t5, _t4)
+    rotation_quaternion(_t4, _t3)
+    for _i in range(4):
+        (found + 6)[_i] = _t3[_i]
+    for a in range(0, 9, 3):
+        for b in range(0, 9, 3):
+            for i in range(3):
+                for j in range(3):
+                    turned[(i) * 3 + j] = (((to_n[(i) * 3 + 0] * covariance[(a) * n + (b + j)]) + (to_n[(i) * 3 + 1] * covariance[((a + 1)) * n + (b + j)])) + (to_n[(i) * 3 + 2] * covariance[((a + 2)) * n + (b + j)]))
+            for i in range(3):
+                for j in range(3):
+                    found[(((10 + (9 * (a + i))) + b) + j)] = (((turned[(i) * 3 + 0] * to_n[(j) * 3 + 0]) + (turned[(i) * 3 + 1] * to_n[(j) * 3 + 1])) + (turned[(i) * 3 + 2] * to_n[(j) * 3 + 2]))
+    for _i in range(ANSWER_SIZE):
+        out[_i] = found[_i]
+    return
+
+# ---------------- fusiond.filter.observations
+
+cdef bint observations_observe(State* state, int64_t model, double* row, double* parameter, Observation* seen) noexcept nogil:
+    if model == 0:
+        return gnss_position_observe(state, row, parameter, seen)
+    elif model == 1:
+        return gnss_velocity_observe(state, row, parameter, seen)
+    elif model == 2:
+        return wheel_speed_observe(state, row, parameter, seen)
+    elif model == 3:
+        return barometric_height_observe(state, row, parameter, seen)
+    elif model == 4:
+        return gnss_yaw_observe(state, row, parameter, seen)
+    return False
+
+# ---------------- fusiond.filter.observations.barometric_height
+
+cdef bint barometric_height_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double* x
+    cdef double to_n[3 * 3]
+    cdef int _i
+    cdef (double, double, double) _t1
+    cdef double _
+    cdef double height
+    x = state.nominal
+    wgs84_mat_ne(x, to_n)
+    model_begin(seen, 1)
+    for _i in range(3):
+        (seen.jacobian + (0) * n)[_i] = (-(to_n + (2) * 3)[_i])
+    seen.jacobian[(0) * n + 26] = 1.0
+    _t1 = wgs84_geodetic(x)
+    _ = _t1[0]
+    _ = _t1[1]
+    height = _t1[2]
+    seen.innovation[0] = ((row[0] - height) - x[27])
+    seen.variance[0] = row[1]
+    return True
+
+# ---------------- fusiond.filter.observations.gnss_position
+
+cdef bint gnss_position_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double* x
+    cdef double to_n[3 * 3]
+    cdef double delay
+    cdef double lever_e[3]
+    cdef double _t1[3]
+    cdef int _i
+    cdef double _t2[3]
+    cdef double _t3[3 * 3]
+    cdef int64_t i
+    cdef double off_e[3]
+    cdef double _t4[3]
+    cdef double _t5
+    x = state.nominal
+    wgs84_mat_ne(x, to_n)
+    model_begin(seen, 3)
+    delay = 0.0
+    if (parameter[4] != 0.0):
+        delay = x[25]
+        gnss_position__calibrated(state, parameter, to_n, seen, _t1)
+        for _i in range(3):
+            lever_e[_i] = _t1[_i]
+    else:
+        model_mat_eb(state, _t3)
+        rotation_times(_t3, parameter, _t2)
+        for _i in range(3):
+            lever_e[_i] = _t2[_i]
+    for i in range(3):
+        for _i in range(3):
+            (seen.jacobian + (i) * n)[_i] = (to_n + (i) * 3)[_i]
+    model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
+    for _i in range(3):
+        off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
+    rotation_times(to_n, off_e, _t4)
+    for _i in range(3):
+        seen.innovation[_i] = _t4[_i]
+    _t5 = row[3]
+    seen.variance[0] = _t5
+    seen.variance[1] = _t5
+    seen.variance[2] = row[4]
+    return True
+
+cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n, Observation* seen, double* out) noexcept nogil:
+    cdef double* x
+    cdef double rotation[3 * 3]
+    cdef double delay
+    cdef double arm_b[3]
+    cdef int _i
+    cdef double swing_b[3]
+    cdef double _t1[3]
+    cdef double turned[3 * 3]
+    cdef double _t2[3]
+    cdef int64_t i
+    cdef double along
+    cdef int64_t j
+    cdef double _t3[3]
+    x = state.nominal
+    model_mat_eb(state, rotation)
+    delay = x[25]
+    for _i in range(3):
+        arm_b[_i] = (lever_b[_i] + (x + 22)[_i])
+    model_rate_b(state, _t1)
+    rotation_cross(_t1, arm_b, swing_b)
+    rotation_matrix_product(to_n, rotation, turned)
+    model_skew_rows(turned, arm_b, (-delay), 3, seen.jacobian, 9)
+    model_mean_rate_b(state, _t2)
+    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 21)
+    for i in range(3):
+        along = 0.0
+        for j in range(3):
+            seen.jacobian[(i) * n + (3 + j)] = (to_n[(i) * 3 + j] * (-delay))
+            seen.jacobian[(i) * n + (21 + j)] += turned[(i) * 3 + j]
+            along += ((to_n[(i) * 3 + j] * x[(3 + j)]) + (turned[(i) * 3 + j] * swing_b[j]))
+        seen.jacobian[(i) * n + 24] = (-along)
+    for _i in range(3):
+        _t3[_i] = (arm_b[_i] - (swing_b[_i] * delay))
+    rotation_times(rotation, _t3, out)
+    return
+
+# ---------------- fusiond.filter.observations.gnss_velocity
+
+cdef double gnss_velocity_lowest_speed(double* row) noexcept nogil:
+    return (sqrt(((row[0] * row[0]) + (row[1] * row[1]))) - (3 * sqrt(row[3])))
+
+cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double* x
+    cdef int64_t axes
+    cdef double to_n[3 * 3]
+    cdef double rotation[3 * 3]
+    cdef double arm_b[3]
+    cdef int _i
+    cdef double swing_e[3]
+    cdef double _t1[3]
+    cdef double _t2[3]
+    cdef double turned[3 * 3]
+    cdef int64_t i
+    cdef double _t3[3]
+    cdef double predicted_n[3]
+    cdef double _t4[3]
+    x = state.nominal
+    axes = (<int64_t>(row[4]))
+    wgs84_mat_ne(x, to_n)
+    model_mat_eb(state, rotation)
+    for _i in range(3):
+        arm_b[_i] = parameter[_i]
+    if (parameter[4] != 0.0):
+        for _i in range(3):
+            arm_b[_i] += (x + 22)[_i]
+    model_rate_b(state, _t2)
+    rotation_cross(_t2, arm_b, _t1)
+    rotation_times(rotation, _t1, swing_e)
+    rotation_matrix_product(to_n, rotation, turned)
+    model_begin(seen, axes)
+    for i in range(axes):
+        for _i in range(3):
+            (seen.jacobian + (i) * n + 3)[_i] = (to_n + (i) * 3)[_i]
+    if (parameter[4] != 0.0):
+        gnss_velocity__gained(state, to_n, turned, seen, _t3)
+        for _i in range(3):
+            swing_e[_i] -= _t3[_i]
+    for i in range(axes):
+        seen.jacobian[(i) * n + 6] += ((-1.0) * ((to_n[(i) * 3 + 1] * swing_e[2]) - (to_n[(i) * 3 + 2] * swing_e[1])))
+        seen.jacobian[(i) * n + (6 + 1)] += ((-1.0) * ((to_n[(i) * 3 + 2] * swing_e[0]) - (to_n[(i) * 3 + 0] * swing_e[2])))
+        seen.jacobian[(i) * n + (6 + 2)] += ((-1.0) * ((to_n[(i) * 3 + 0] * swing_e[1]) - (to_n[(i) * 3 + 1] * swing_e[0])))
+    model_skew_rows(turned, arm_b, 1.0, axes, seen.jacobian, 9)
+    for _i in range(3):
+        _t4[_i] = ((x + 3)[_i] + swing_e[_i])
+    rotation_times(to_n, _t4, predicted_n)
+    for i in range(axes):
+        seen.innovation[i] = (row[i] - predicted_n[i])
+        seen.variance[i] = row[3]
+    return True
+
+cdef void gnss_velocity__gained(State* state, double* to_n, double* turned, Observation* seen, double* out) noexcept nogil:
+    cdef double* x
+    cdef double delay
+    cdef double force_e[3]
+    cdef double _t1[3 * 3]
+    cdef double _t2[3]
+    cdef int _i
+    cdef double rest_e[3]
+    cdef double _t3[3]
+    cdef int64_t i
+    cdef double along
+    cdef int64_t j
+    x = state.nominal
+    delay = (x[25] + x[(25 + 1)])
+    model_mat_eb(state, _t1)
+    for _i in range(3):
+        _t2[_i] = ((state.auxiliary + 36)[_i] - (x + 13)[_i])
+    rotation_times(_t1, _t2, force_e)
+    wgs84_gravity_e(x, rest_e)
+    rest_e[0] += ((2 * 7.292115e-05) * x[(3 + 1)])
+    rest_e[1] -= ((2 * 7.292115e-05) * x[3])
+    model_mean_rate_b(state, _t3)
+    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 21)
+    model_skew_rows(to_n, rest_e, (-delay), seen.m, seen.jacobian, 6)
+    for i in range(seen.m):
+        along = 0.0
+        for j in range(3):
+            along += (to_n[(i) * 3 + j] * (force_e[j] + rest_e[j]))
+            seen.jacobian[(i) * n + (12 + j)] = (turned[(i) * 3 + j] * delay)
+        seen.jacobian[(i) * n + 24] = (-along)
+        seen.jacobian[(i) * n + (24 + 1)] = (-along)
+        seen.jacobian[(i) * n + 3] += (to_n[(i) * 3 + 1] * ((2 * 7.292115e-05) * delay))
+        seen.jacobian[(i) * n + (3 + 1)] -= (to_n[(i) * 3 + 0] * ((2 * 7.292115e-05) * delay))
+    for _i in range(3):
+        out[_i] = ((force_e[_i] + rest_e[_i]) * delay)
+    return
+
+# ---------------- fusiond.filter.observations.gnss_yaw
+
+cdef bint gnss_yaw_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double to_n[3 * 3]
+    cdef double baseline_e[3]
+    cdef double _t1[3 * 3]
+    cdef double baseline_n[3]
+    cdef double north
+    cdef double east
+    cdef double level
+    cdef double by_attitude[3 * n]
+    cdef int64_t i
+    cdef double sine
+    cdef double cosine
+    wgs84_mat_ne(state.nominal, to_n)
+    model_mat_eb(state, _t1)
+    rotation_times(_t1, parameter + 4, baseline_e)
+    rotation_times(to_n, baseline_e, baseline_n)
+    north, east = baseline_n[0], baseline_n[1]
+    level = ((north * north) + (east * east))
+    if (level < portable_square(0.2)):
+        return False
+    memset(by_attitude, 0, 3 * n * sizeof(double))
+    model_skew_rows(to_n, baseline_e, (-1.0), 2, by_attitude, 6)
+    model_begin(seen, 1)
+    for i in range(6, 9):
+        seen.jacobian[(0) * n + i] = (((north * by_attitude[(1) * n + i]) - (east * by_attitude[(0) * n + i])) / level)
+    sine, cosine = row[0], row[1]
+    seen.innovation[0] = portable_atan2(((north * sine) - (east * cosine)), ((north * cosine) + (east * sine)))
+    seen.variance[0] = row[2]
+    return True
+
+# ---------------- fusiond.filter.observations.model
+
+cdef void model_begin(Observation* seen, int64_t axes) noexcept nogil:
+    cdef int64_t a
+    cdef int _i
+    seen.m = axes
+    for a in range(axes):
+        for _i in range(n):
+            (seen.jacobian + (a) * n)[_i] = 0.0
+
+cdef void model_skew_rows(double* rows, double* v, double factor, int64_t axes, double* jacobian, int64_t column) noexcept nogil:
+    cdef int64_t i
+    for i in range(axes):
+        jacobian[(i) * n + column] = (factor * ((rows[(i) * 3 + 1] * v[2]) - (rows[(i) * 3 + 2] * v[1])))
+        jacobian[(i) * n + (column + 1)] = (factor * ((rows[(i) * 3 + 2] * v[0]) - (rows[(i) * 3 + 0] * v[2])))
+        jacobian[(i) * n + (column + 2)] = (factor * ((rows[(i) * 3 + 0] * v[1]) - (rows[(i) * 3 + 1] * v[0])))
+
+cdef void model_with_rate_noise(State* state, Observation* seen) noexcept nogil:
+    cdef int64_t a
+    cdef double* by
+    for a in range(seen.m):
+        by = seen.jacobian + (a) * n + 9
+        seen.variance[a] += (state.auxiliary[35] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
+
+cdef void model_mean_rate_b(State* state, double* out) noexcept nogil:
+    cdef int _i
+    for _i in range(3):
+        out[_i] = ((state.auxiliary + 15)[_i] - (state.nominal + 10)[_i])
+    return
+
+cdef void model_mat_eb(State* state, double* out) noexcept nogil:
+    rotation_matrix(state.nominal + 6, out)
+    return
+
+cdef void model_rate_b(State* state, double* out) noexcept nogil:
+    cdef int _i
+    for _i in range(3):
+        out[_i] = ((state.auxiliary + 9)[_i] - (state.nominal + 10)[_i])
+    return
+
+cdef void model_point_velocity_v(State* state, double* point_b, int64_t axes, double* jacobian, double* out) noexcept nogil:
+    cdef double* x
+    cdef double c[3 * 3]
+    cdef double swing_b[3]
+    cdef double _t1[3]
+    cdef double along_b[3]
+    cdef double velocity_b[3]
+    cdef int _i
+    cdef (double, double) _t2
+    cdef double sp
+    cdef double cp
+    cdef (double, double) _t3
+    cdef double sy
+    cdef double cy
+    cdef double mat_vb[3 * 3]
+    cdef double turned[3 * 3]
+    cdef int64_t i
+    cdef int64_t j
+    cdef double _t4[3]
+    cdef double _t5[3]
+    cdef double mean_b[3]
+    cdef double by_mount[3 * 3]
+    x = state.nominal
+    rotation_matrix(x + 6, c)
+    model_rate_b(state, _t1)
+    rotation_cross(_t1, point_b, swing_b)
+    rotation_transposed_times(c, x + 3, along_b)
+    for _i in range(3):
+        velocity_b[_i] = (along_b[_i] + swing_b[_i])
+    _t2 = portable_sin_cos(x[17])
+    sp = _t2[0]
+    cp = _t2[1]
+    _t3 = portable_sin_cos(x[(17 + 1)])
+    sy = _t3[0]
+    cy = _t3[1]
+    mat_vb[0] = (cy * cp)
+    mat_vb[1] = (-sy)
+    mat_vb[2] = (cy * sp)
+    mat_vb[3] = (sy * cp)
+    mat_vb[4] = cy
+    mat_vb[5] = (sy * sp)
+    mat_vb[6] = (-sp)
+    mat_vb[7] = 0.0
+    mat_vb[8] = cp
+    for i in range(axes):
+        for _i in range(n):
+            (jacobian + (i) * n)[_i] = 0.0
+        for j in range(3):
+            turned[(i) * 3 + j] = (((mat_vb[(i) * 3 + 0] * c[(j) * 3 + 0]) + (mat_vb[(i) * 3 + 1] * c[(j) * 3 + 1])) + (mat_vb[(i) * 3 + 2] * c[(j) * 3 + 2]))
+        for _i in range(3):
+            (jacobian + (i) * n + 3)[_i] = (turned + (i) * 3)[_i]
+    model_skew_rows(turned, x + 3, 1.0, axes, jacobian, 6)
+    model_skew_rows(mat_vb, point_b, 1.0, axes, jacobian, 9)
+    model_mean_rate_b(state, _t5)
+    rotation_cross(_t5, point_b, _t4)
+    for _i in range(3):
+        mean_b[_i] = (along_b[_i] + _t4[_i])
+    by_mount[0] = ((((-cy) * sp) * mean_b[0]) + ((cy * cp) * mean_b[2]))
+    by_mount[1] = (((((-sy) * cp) * mean_b[0]) - (cy * mean_b[1])) - ((sy * sp) * mean_b[2]))
+    by_mount[2] = 0.0
+    by_mount[3] = ((((-sy) * sp) * mean_b[0]) + ((sy * cp) * mean_b[2]))
+    by_mount[4] = ((((cy * cp) * mean_b[0]) - (sy * mean_b[1])) + ((cy * sp) * mean_b[2]))
+    by_mount[5] = 0.0
+    by_mount[6] = (((-cp) * mean_b[0]) - (sp * mean_b[2]))
+    by_mount[7] = 0.0
+    by_mount[8] = 0.0
+    for i in range(axes):
+        jacobian[(i) * n + 16] = by_mount[(i) * 3 + 0]
+        jacobian[(i) * n + (16 + 1)] = by_mount[(i) * 3 + 1]
+    rotation_times(mat_vb, velocity_b, out)
+    return
+
+# ---------------- fusiond.filter.observations.non_holonomic
+
+cdef bint non_holonomic_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double velocity_v[3]
+    non_holonomic__observe(state, parameter, seen, velocity_v)
+    return (fabs(velocity_v[0]) >= parameter[5])
+
+cdef double non_holonomic_observe_at_any_speed(State* state, double* parameter, Observation* seen) noexcept nogil:
+    cdef double velocity_v[3]
+    non_holonomic__observe(state, parameter, seen, velocity_v)
+    return sqrt(((velocity_v[0] * velocity_v[0]) + (velocity_v[1] * velocity_v[1])))
+
+cdef void non_holonomic__observe(State* state, double* parameter, Observation* seen, double* out) noexcept nogil:
+    cdef double by[3 * n]
+    cdef double velocity_v[3]
+    cdef int64_t i
+    cdef int _i
+    model_point_velocity_v(state, parameter, 3, by, velocity_v)
+    seen.m = 2
+    for i in range(2):
+        for _i in range(n):
+            (seen.jacobian + (i) * n)[_i] = (by + ((1 + i)) * n)[_i]
+        seen.innovation[i] = (-velocity_v[(1 + i)])
+    seen.variance[0], seen.variance[1] = parameter[3], parameter[4]
+    for _i in range(3):
+        out[_i] = velocity_v[_i]
+    return
+
+# ---------------- fusiond.filter.observations.wheel_speed
+
+cdef bint wheel_speed_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    return wheel_speed__observe(state, row, parameter, seen, False)
+
+cdef bint wheel_speed_observe_certain(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    return wheel_speed__observe(state, row, parameter, seen, True)
+
+cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Observation* seen, bint certain) noexcept nogil:
+    cdef bint steered
+    cdef double by[3 * n]
+    cdef double velocity_v[3]
+    cdef double forward
+    cdef double sideways
+    cdef double speed
+    cdef int64_t which
+    cdef double scale
+    cdef double* jacobian
+    cdef double track
+    cdef double along
+    cdef double across
+    cdef int _i
+    cdef double reading
+    cdef double variance
+    cdef double reach[n]
+    cdef int64_t k
+    cdef double spread
+    cdef double sure
+    steered = (parameter[4] != 0.0)
+    model_point_velocity_v(state, parameter, (2 if steered else 1), by, velocity_v)
+    forward, sideways = velocity_v[0], velocity_v[1]
+    speed = forward
+    which = (<int64_t>(parameter[6]))
+    scale = (1 + state.nominal[(which + 1)])
+    jacobian = seen.jacobian + (0) * n
+    track = sqrt(((forward * forward) + (sideways * sideways)))
+    if (steered and (track > 0.5)):
+        speed = (track if (forward >= 0) else (-track))
+        along, across = (forward / speed), (sideways / speed)
+        for _i in range(n):
+            jacobian[_i] = (scale * ((along * (by + (0) * n)[_i]) + (across * (by + (1) * n)[_i])))
+    else:
+        for _i in range(n):
+            jacobian[_i] = (scale * (by + (0) * n)[_i])
+    jacobian[which] = speed
+    reading, variance = row[0], row[1]
+    if ((parameter[5] != 0.0) and (reading > 0)):
+        if (certain or (fabs(speed) > 2.0)):
+            if (speed < 0):
+                reading = (-reading)
+        else:
+            memset(reach, 0, n * sizeof(double))
+            for k in range(n):
+                if (jacobian[k] != 0.0):
+                    axpy(reach, jacobian[k], state.covariance + (k) * n)
+            spread = (variance + linear_dot(jacobian, reach))
+            sure = wheel_speed_direction((((reading * scale) * speed) / spread))
+            variance += (((100.0 * reading) * reading) * (1 - (sure * sure)))
+            reading *= sure
+    seen.m = 1
+    seen.innovation[0] = (reading - (scale * speed))
+    seen.variance[0] = variance
+    return True
+
+cdef double wheel_speed_direction(double odds) noexcept nogil:
+    cdef double other
+    cdef double sure
+    other = portable_exp(((-2) * fabs(odds)))
+    sure = ((1 - other) / (1 + other))
+    return ((-sure) if (odds < 0) else sure)
+
+# ---------------- fusiond.filter.observations.zero_rotation
+
+cdef bint zero_rotation_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double c[3 * 3]
+    cdef int64_t i
+    cdef double turned
+    model_mat_eb(state, c)
+    model_begin(seen, 3)
+    for i in range(3):
+        seen.jacobian[(i) * n + (9 + i)] = 1.0
+        seen.jacobian[(i) * n + 6] = (c[(1) * 3 + i] * 7.292115e-05)
+        seen.jacobian[(i) * n + (6 + 1)] = (-(c[(0) * 3 + i] * 7.292115e-05))
+        turned = (state.auxiliary[(9 + i)] - state.nominal[(10 + i)])
+        seen.innovation[i] = (turned - (c[(2) * 3 + i] * 7.292115e-05))
+        seen.variance[i] = parameter[0]
+    return True
+
+# ---------------- fusiond.filter.observations.zero_velocity
+
+cdef bint zero_velocity_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef int64_t i
+    model_begin(seen, 3)
+    for i in range(3):
+        seen.jacobian[(i) * n + (3 + i)] = 1.0
+        seen.innovation[i] = (-state.nominal[(3 + i)])
+        seen.variance[i] = parameter[0]
+    return True
+
+# ---------------- fusiond.filter.source_health
+
+cdef void source_health_begin(double* memory) noexcept nogil:
+    cdef int64_t i
+    cdef int _i
+    for i in range(4):
+        memory[(4 + i)] = PRIOR[i]
+    for _i in range(3):
+        (memory + 8)[_i] = 0.0
+    memory[11] = 100.0
+
+cdef bint source_health_observes_sensor(double* spread, double* variance, int64_t m) noexcept nogil:
+    cdef double _t1
+    cdef double total
+    cdef double own
+    cdef int64_t a
+    _t1 = 0.0
+    total = _t1
+    own = _t1
+    for a in range(m):
+        total += spread[(a) * 3 + a]
+        own += variance[a]
+    return (total <= (4.0 * own))
+
+cdef void source_health_judge_repetition(double* memory, int64_t* stamps, bint same, int64_t t_ns) noexcept nogil:
+    cdef double nothing[3]
+    if source_health_is_due(stamps, t_ns, 0.0):
+        memset(nothing, 0, 3 * sizeof(double))
+        source_health_judge(memory, stamps, nothing, 0, same, t_ns)
+
+cdef bint source_health_is_due(int64_t* stamps, int64_t t_ns, double correlation) noexcept nogil:
+    cdef int64_t pause
+    pause = (<int64_t>((2000000000.0 * correlation)))
+    return ((stamps[3] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[3]) >= (pause if pause > 50000000 else 50000000)))
+
+cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened, int64_t m, bint same, int64_t t_ns) noexcept nogil:
+    cdef double elapsed
+    cdef double blurred
+    cdef (double, double, double, double) _t1
+    cdef double nominal
+    cdef double noisy
+    cdef double biased
+    cdef double frozen
+    cdef double total
+    cdef int64_t i
+    if ((((memory[4] + memory[5]) + memory[6]) + memory[7]) == 0):
+        source_health_begin(memory)
+    elapsed = 20.0
+    if (stamps[3] != (<int64_t>-4611686018427387904)):
+        elapsed = ((t_ns - stamps[3]) * 1e-09)
+    stamps[3] = t_ns
+    blurred = (1 - portable_exp(((-elapsed) / 20.0)))
+    source_health__renew_bias(memory, whitened, m)
+    _t1 = source_health_likelihoods(memory, whitened, m, same)
+    nominal = _t1[0]
+    noisy = _t1[1]
+    biased = _t1[2]
+    frozen = _t1[3]
+    memory[4] = ((memory[4] + (blurred * (0.997 - memory[4]))) * nominal)
+    memory[5] = ((memory[5] + (blurred * (0.001 - memory[5]))) * noisy)
+    memory[6] = ((memory[6] + (blurred * (0.001 - memory[6]))) * biased)
+    memory[7] = ((memory[7] + (blurred * (0.001 - memory[7]))) * frozen)
+    total = 0.0
+    for i in range(4):
+        total += memory[(4 + i)]
+    for i in range(4):
+        memory[(4 + i)] = (memory[(4 + i)] / total)
+    source_health__follow_bias(memory, whitened, m)
+
+cdef (double, double, double, double) source_health_likelihoods(double* memory, double* whitened, int64_t m, bint same) noexcept nogil:
+    cdef double _t1
+    cdef double square
+    cdef double off
+    cdef double stretch
+    cdef int64_t a
+    cdef double rest
+    cdef double outlier
+    cdef double good
+    cdef double noisy
+    cdef double biased
+    _t1 = 0.0
+    square = _t1
+    off = _t1
+    stretch = source_health__stretch(memory, m)
+    for a in range(m):
+        square += (whitened[a] * whitened[a])
+        rest = (whitened[a] - (memory[(8 + a)] * stretch))
+        off += (rest * rest)
+    square = (1000.0 if 1000.0 < square else square)
+    outlier = source_health__density(square, 100.0, m)
+    good = (((1 - 0.01) * source_health__density(square, 1.0, m)) + (0.01 * outlier))
+    noisy = (((1 - 0.01) * source_health__density(square, 16.0, m)) + (0.01 * outlier))
+    biased = (((1 - 0.01) * source_health__density(off, (1 + memory[11]), m)) + (0.01 * outlier))
+    if (not same):
+        return (good, noisy, biased, (outlier * 0.001))
+    return ((good * 0.3333333333333333), (noisy * 0.05), (biased * 0.05), outlier)
+
+cdef void source_health__renew_bias(double* memory, double* whitened, int64_t m) noexcept nogil:
+    cdef double _t1
+    cdef double square
+    cdef double off
+    cdef int64_t a
+    cdef double rest
+    cdef int _i
+    _t1 = 0.0
+    square = _t1
+    off = _t1
+    for a in range(m):
+        square += (whitened[a] * whitened[a])
+        rest = (whitened[a] - memory[(8 + a)])
+        off += (rest * rest)
+    if (source_health__density(square, (1 + 100.0), m) > source_health__density(off, (1 + memory[11]), m)):
+        for _i in range(3):
+            (memory + 8)[_i] = 0.0
+        memory[11] = 100.0
+
+cdef double source_health__density(double square, double variance, int64_t m) noexcept nogil:
+    cdef double root
+    cdef double scale
+    cdef int64_t _a
+    root = sqrt(variance)
+    scale = 1.0
+    for _a in range(m):
+        scale *= root
+    return (portable_exp(((-square) / (2 * variance))) / scale)
+
+cdef double source_health__stretch(double* memory, int64_t m) noexcept nogil:
+    cdef double size
+    cdef int64_t a
+    if (memory[11] >= 1.0):
+        return 1.0
+    size = 0.0
+    for a in range(m):
+        size += (memory[(8 + a)] * memory[(8 + a)])
+    size = sqrt(size)
+    return ((3.0 / size) if (1e-09 < size < 3.0) else 1.0)
+
+cdef void source_health__follow_bias(double* memory, double* whitened, int64_t m) noexcept nogil:
+    cdef double variance
+    cdef double gain
+    cdef int64_t a
+    variance = (memory[11] + 0.01)
+    gain = (variance / (variance + 1))
+    for a in range(m):
+        memory[(8 + a)] += (gain * (whitened[a] - memory[(8 + a)]))
+    memory[11] = ((1 - gain) * variance)
+
+cdef bint source_health_is_trusted(double* memory) noexcept nogil:
+    return ((memory[6] + memory[7]) <= 0.5)
+
+cdef double source_health_noise_factor(double* memory, double lowest, double highest) noexcept nogil:
+    cdef double beyond
+    cdef double _t1
+    cdef double _t2
+    beyond = 0.0
+    if (memory[3] > 0.2):
+        beyond = (memory[3] - 0.2)
+    elif (memory[3] < (-0.2)):
+        beyond = (memory[3] + 0.2)
+    _t1 = (1 + beyond)
+    _t2 = (lowest if lowest > _t1 else _t1)
+    return (highest if highest < _t2 else _t2)
+
+cdef double source_health_noisy_factor(double* memory) noexcept nogil:
+    return ((1 + ((16.0 - 1) * memory[5])) if (memory[5] > 0.1) else 1.0)
+
+cdef void source_health_learn(double* memory, double* innovation, double* variance, double* spread, int64_t m, double elapsed) noexcept nogil:
+    cdef double _t1
+    cdef double found
+    cdef double configured
+    cdef double nis
+    cdef int64_t a
+    cdef double square
+    cdef double expected
+    cdef double _t2
+    _t1 = 0.0
+    found = _t1
+    configured = _t1
+    nis = _t1
+    for a in range(m):
+        square, expected = (innovation[a] * innovation[a]), (spread[(a) * 3 + a] + variance[a])
+        nis += (square / expected)
+        _t2 = (25.0 * expected)
+        found += ((_t2 if _t2 < square else square) - spread[(a) * 3 + a])
+        configured += variance[a]
+    memory[17] += ((elapsed / (10.0 + elapsed)) * ((nis / m) - memory[17]))
+    if (configured > 0):
+        memory[3] += ((elapsed / (30.0 + elapsed)) * (((found / configured) - 1) - memory[3]))
+
+cdef double source_health_since_last(int64_t* stamps, int64_t t_ns) noexcept nogil:
+    if (stamps[0] == (<int64_t>-4611686018427387904)):
+        return 0.0
+    return ((t_ns - stamps[0]) * 1e-09)
+
+cdef bint source_health_arrive(double* memory, int64_t* stamps, double* values, int64_t t_ns) noexcept nogil:
+    cdef double total
+    cdef bint same
+    cdef double elapsed
+    cdef double share
+    total = ((values[0] + values[1]) + values[2])
+    same = ((stamps[0] != (<int64_t>-4611686018427387904)) and (total == memory[12]))
+    memory[12] = total
+    elapsed = source_health_since_last(stamps, t_ns)
+    if (elapsed > 0):
+        share = (0.05 if (memory[13] > 0) else 1.0)
+        memory[13] += (share * ((10.0 if 10.0 < elapsed else elapsed) - memory[13]))
+    return same
+
+cdef bint source_health_moved(double* memory, double* innovation, double* variance, int64_t m, double gate) noexcept nogil:
+    cdef double total
+    cdef int64_t a
+    cdef double step
+    total = 0.0
+    for a in range(m):
+        step = (innovation[a] - memory[(14 + a)])
+        total += ((step * step) / (2 * variance[a]))
+        memory[(14 + a)] = innovation[a]
+    return (not (total <= gate))
+
+# ---------------- fusiond.filter.step
+
+cdef void step_step(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil:
+    cdef int64_t t_ns
+    cdef int64_t source
+    cdef bint coasted
+    cdef double variance
+    cdef bint lost
+    t_ns, source = (<int64_t>row.t_ns), (<int64_t>row.source)
+    step__forget_judgement(row)
+    if (state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] == t_ns):
+        row.outcome = 3
+        return
+    row.outcome = 0
+    if (state.stamps[9] == 1):
+        initial_alignment_gather_motion(state, row, plan)
+    elif (state.stamps[9] == 3):
+        step__choose(state, row, imu, plan)
+    else:
+        coasted = step_coasts(state, t_ns, plan)
+        step_advance(state, t_ns, imu, plan)
+        if (plan.models[source] == -1):
+            step_keep_sample(state, row, plan)
+            motion_constraints_constrain(state, plan)
+        else:
+            variance = (step_yaw_variance(state) if coasted else 0.0)
+            lost = (variance > portable_square(0.20943951023931956))
+            if (not (step__measure_lost(state, row, plan, variance) if lost else measurement_measure(state, row, plan))):
+                row.outcome = 1
+        step_guard(state)
+    state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
+
+cdef bint step_can_step(State* state, Row* row, Plan* plan) noexcept nogil:
+    cdef int64_t* stamps
+    cdef int64_t phase
+    cdef int64_t t_ns
+    cdef int64_t model
+    cdef double grown
+    stamps = state.stamps
+    phase = (<int64_t>(state.stamps[9]))
+    t_ns, model = (<int64_t>row.t_ns), (<int64_t>(plan.models[(<int64_t>row.source)]))
+    if ((phase == 0) or ((t_ns - stamps[0]) > plan.restart_gap_ns)):
+        return False
+    if (phase == 1):
+        return (model != 0 and model != 1)
+    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, plan)):
+        grown = (portable_square(0.3) * ((t_ns - stamps[0]) * 1e-09))
+        return (not ((step_yaw_variance(state) + grown) > (portable_square(0.20943951023931956) / 2)))
+    return True
+
+cdef void step__forget_judgement(Row* row) noexcept nogil:
+    cdef int _i
+    row.ratio = 0.0
+    for _i in range(3):
+        row.innovation[_i] = 0.0
+    for _i in range(3):
+        row.variance[_i] = 0.0
+
+cdef bint step__measure_lost(State* state, Row* row, Plan* plan, double variance) noexcept nogil:
+    cdef bint fused
+    cdef double gained
+    cdef double* r
+    cdef int64_t phi
+    cdef int64_t i
+    cdef int64_t j
+    fused = measurement_measure(state, row, plan)
+    gained = (variance - step_yaw_variance(state))
+    if (gained > 0):
+        r = state.nominal
+        phi = 6
+        gained /= (((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2]))
+        for i in range(3):
+            for j in range(3):
+                state.covariance[((phi + i)) * n + (phi + j)] += ((r[i] * r[j]) * gained)
+    return fused
+
+cdef bint step_coasts(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
+    return ((t_ns - state.stamps[1]) > plan.imu_gap_ns)
+
+cdef bint step_settles(State* state, int64_t source, Plan* plan) noexcept nogil:
+    return ((plan.models[source] == -1) or step_coasts(state, state.stamps[0], plan))
+
+cdef double step_yaw_variance(State* state) noexcept nogil:
+    cdef double* r
+    cdef int64_t phi
+    cdef double total
+    cdef int64_t i
+    cdef int64_t j
+    r = state.nominal
+    phi = 6
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += ((r[i] * state.covariance[((phi + i)) * n + (phi + j)]) * r[j])
+    return (total / (((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2])))
+
+cdef void step_advance(State* state, int64_t t_ns, Row* imu, Plan* plan) noexcept nogil:
+    cdef int64_t* stamps
+    cdef double* a
+    cdef int64_t begin
+    cdef int64_t held
+    cdef double dt
+    cdef bint frozen
+    cdef double* sample
+    cdef double span
+    cdef double middle
+    cdef double end
+    cdef double force_change[3]
+    cdef int _i
+    cdef double rate_change[3]
+    cdef double force_b[3]
+    cdef double rate_b[3]
+    stamps = state.stamps
+    a = state.auxiliary
+    begin, held = (<int64_t>(stamps[0])), (<int64_t>(stamps[1]))
+    if (t_ns <= begin):
+        return
+    dt = ((t_ns - begin) * 1e-09)
+    stamps[0] = t_ns
+    frozen = (not source_health_is_trusted(state.memory + (plan.imu_source) * MEMORY_SIZE))
+    if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > plan.imu_gap_ns) or frozen):
+        strapdown_coast(state, dt, &plan.noise, motion_constraints_rests(state, plan))
+        a[35] = (0.5 * 0.5)
+        return
+    sample = imu.values
+    span = (<double>((imu.t_ns - held)))
+    middle = (((<double>(((begin - held) + (t_ns - held)))) / 2) / span)
+    end = ((<double>((t_ns - held))) / span)
+    for _i in range(3):
+        force_change[_i] = (sample[_i] - a[_i])
+    for _i in range(3):
+        rate_change[_i] = ((sample + 3)[_i] - (a + 3)[_i])
+    for _i in range(3):
+        force_b[_i] = (a[_i] + (middle * force_change[_i]))
+    for _i in range(3):
+        rate_b[_i] = ((a + 3)[_i] + (middle * rate_change[_i]))
+    for _i in range(3):
+        (a + 6)[_i] = (a[_i] + (end * force_change[_i]))
+    for _i in range(3):
+        (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
+    a[35] = ((plan.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
+    strapdown_propagate(state, dt, force_b, rate_b, &plan.noise)
+
+cdef void step_predict(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
+    cdef int64_t* stamps
+    cdef double* a
+    cdef int64_t begin
+    cdef int64_t _t1
+    cdef int64_t _t2
+    cdef int64_t until
+    stamps = state.stamps
+    a = state.auxiliary
+    begin = (<int64_t>(stamps[0]))
+    if ((t_ns <= begin) or (stamps[9] != 2)):
+        return
+    _t1 = (<int64_t>((stamps[1] + plan.imu_gap_ns)))
+    _t2 = (_t1 if _t1 < t_ns else t_ns)
+    until = (_t2 if _t2 > begin else begin)
+    if (not source_health_is_trusted(state.memory + (plan.imu_source) * MEMORY_SIZE)):
+        until = begin
+    if (until > begin):
+        strapdown_propagate(state, ((until - begin) * 1e-09), a, a + 3, &plan.noise)
+    if (t_ns > until):
+        strapdown_coast(state, ((t_ns - until) * 1e-09), &plan.noise, motion_constraints_rests(state, plan))
+    stamps[0] = t_ns
+
+cdef void step__choose(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil:
+    cdef int64_t* stamps
+    cdef int64_t source
+    cdef int64_t t_ns
+    cdef int64_t begin
+    cdef int64_t model
+    cdef double* values
+    cdef int64_t i
+    cdef State hypothesis
+    cdef double* memory
+    cdef int64_t* own
+    cdef double* parameter
+    cdef double factor
+    stamps = state.stamps
+    source = (<int64_t>row.source)
+    t_ns = (<int64_t>row.t_ns)
+    begin = (<int64_t>(stamps[0]))
+    model = (<int64_t>(plan.models[source]))
+    values = row.values
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            stamps[0] = begin
+            hypothesis = hypothesis_of(state, i)
+            step_advance(&hypothesis, t_ns, imu, plan)
+    stamps[0] = (t_ns if t_ns > begin else begin)
+    if (model == -1):
+        step_keep_sample(state, row, plan)
+        heading_bank_constrain(state, plan)
+        return
+    memory = state.memory + (source) * MEMORY_SIZE
+    own = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
+    parameter = plan.parameters + (source) * PARAMETERS
+    source_health_arrive(memory, own, values, t_ns)
+    measurement_remember(memory, model, values)
+    if ((model == 2) and motion_constraints_carried(state, memory[0], plan)):
+        row.outcome = 1
+        return
+    factor = measurement_factor_of(own, model, values, parameter, t_ns)
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            heading_bank_measure(state, i, model, values, parameter, factor, plan)
+    own[1] = t_ns
+    if (model == 0):
+        stamps[4] = t_ns
+    heading_bank_settle(state, plan)
+
+cdef void step_keep_sample(State* state, Row* row, Plan* plan) noexcept nogil:
+    cdef int64_t* stamps
+    cdef double* a
+    cdef int64_t t_ns
+    cdef double dt
+    cdef double* memory
+    cdef int64_t* own
+    cdef bint same
+    stamps = state.stamps
+    a = state.auxiliary
+    t_ns = (<int64_t>row.t_ns)
+    dt = (((t_ns - stamps[1]) * 1e-09) if (stamps[1] != (<int64_t>-4611686018427387904)) else 0.0)
+    memory = state.memory + (plan.imu_source) * MEMORY_SIZE
+    own = state.source_stamps + (plan.imu_source) * SOURCE_STAMPS_SIZE
+    same = source_health_arrive(memory, own, row.values, t_ns)
+    source_health_judge_repetition(memory, own, same, t_ns)
+    step_hold(state, row.values, t_ns)
+    a[35] = ((plan.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
+    motion_constraints_watch(state, a, a + 3, dt, plan)
+
+cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
+    cdef double* a
+    cdef int64_t i
+    cdef double _t1
+    cdef double _t2
+    a = state.auxiliary
+    state.stamps[1] = t_ns
+    for i in range(3):
+        _t1 = values[i]
+        a[(0 + i)] = _t1
+        a[(6 + i)] = _t1
+        _t2 = values[(3 + i)]
+        a[(3 + i)] = _t2
+        a[(9 + i)] = _t2
+
+cdef void step_guard(State* state) noexcept nogil:
+    cdef double total
+    cdef int64_t i
+    cdef int64_t resets
+    cdef int64_t blown
+    total = 0.0
+    for i in range(NOMINAL_SIZE):
+        total += state.nominal[i]
+    for i in range(n):
+        total += state.covariance[(i) * n + i]
+    if isfinite(total):
+        return
+    resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
+    clear_state(state)
+    state.stamps[10], state.stamps[17] = (resets + 1), (blown + 1)
+    state.stamps[18] = 3
+
+cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int64_t source, int64_t sequence) noexcept nogil:
+    cdef int64_t i
+    cdef Row* row
+    i = end
+    while (i > begin):
+        row = (rows + (i - 1))
+        if (row.t_ns < t_ns):
+            break
+        if (row.t_ns == t_ns):
+            if (row.source < source):
+                break
+            if (row.source == source):
+                if (row.sequence == sequence):
+                    return (~((i - 1) - begin))
+                if (row.sequence < sequence):
+                    break
+        i -= 1
+    return (i - begin)
+
+cdef int64_t step_first_changed(Row* rows, int64_t begin, int64_t new, Plan* plan) noexcept nogil:
+    cdef int64_t i
+    i = (begin + new)
+    if (plan.models[(<int64_t>(((rows + i)).source))] != -1):
+        return new
+    while ((i > begin) and (plan.models[(<int64_t>(((rows + (i - 1))).source))] != -1)):
+        i -= 1
+    while ((begin < i < (begin + new)) and (((rows + i)).t_ns == ((rows + (i - 1))).t_ns)):
+        i += 1
+    return (i - begin)
 
 # ---------------- fusiond.filter.strapdown
 
@@ -726,1936 +2659,3 @@ cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noe
         for _i in range(n):
             (p + (i) * n)[_i] += (((_t2 * turned[_i]) + (_t3 * displaced[_i])) + (second * ((_t4 * displaced[_i]) + (_t5 * turned[_i]))))
     linear_mirror(p)
-
-# ---------------- fusiond.filter.observations.model
-
-cdef void model_begin(Observation* seen, int64_t axes) noexcept nogil:
-    cdef int64_t a
-    cdef int _i
-    seen.m = axes
-    for a in range(axes):
-        for _i in range(n):
-            (seen.jacobian + (a) * n)[_i] = 0.0
-
-cdef void model_skew_rows(double* rows, double* v, double factor, int64_t axes, double* jacobian, int64_t column) noexcept nogil:
-    cdef int64_t i
-    for i in range(axes):
-        jacobian[(i) * n + column] = (factor * ((rows[(i) * 3 + 1] * v[2]) - (rows[(i) * 3 + 2] * v[1])))
-        jacobian[(i) * n + (column + 1)] = (factor * ((rows[(i) * 3 + 2] * v[0]) - (rows[(i) * 3 + 0] * v[2])))
-        jacobian[(i) * n + (column + 2)] = (factor * ((rows[(i) * 3 + 0] * v[1]) - (rows[(i) * 3 + 1] * v[0])))
-
-cdef void model_with_rate_noise(State* state, Observation* seen) noexcept nogil:
-    cdef int64_t a
-    cdef double* by
-    for a in range(seen.m):
-        by = seen.jacobian + (a) * n + 9
-        seen.variance[a] += (state.auxiliary[35] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
-
-cdef void model_mean_rate_b(State* state, double* out) noexcept nogil:
-    cdef int _i
-    for _i in range(3):
-        out[_i] = ((state.auxiliary + 15)[_i] - (state.nominal + 10)[_i])
-    return
-
-cdef void model_mat_eb(State* state, double* out) noexcept nogil:
-    rotation_matrix(state.nominal + 6, out)
-    return
-
-cdef void model_rate_b(State* state, double* out) noexcept nogil:
-    cdef int _i
-    for _i in range(3):
-        out[_i] = ((state.auxiliary + 9)[_i] - (state.nominal + 10)[_i])
-    return
-
-cdef void model_point_velocity_v(State* state, double* point_b, int64_t axes, double* jacobian, double* out) noexcept nogil:
-    cdef double* x
-    cdef double c[3 * 3]
-    cdef double swing_b[3]
-    cdef double _t1[3]
-    cdef double along_b[3]
-    cdef double velocity_b[3]
-    cdef int _i
-    cdef (double, double) _t2
-    cdef double sp
-    cdef double cp
-    cdef (double, double) _t3
-    cdef double sy
-    cdef double cy
-    cdef double mat_vb[3 * 3]
-    cdef double turned[3 * 3]
-    cdef int64_t i
-    cdef int64_t j
-    cdef double _t4[3]
-    cdef double _t5[3]
-    cdef double mean_b[3]
-    cdef double by_mount[3 * 3]
-    x = state.nominal
-    rotation_matrix(x + 6, c)
-    model_rate_b(state, _t1)
-    rotation_cross(_t1, point_b, swing_b)
-    rotation_transposed_times(c, x + 3, along_b)
-    for _i in range(3):
-        velocity_b[_i] = (along_b[_i] + swing_b[_i])
-    _t2 = portable_sin_cos(x[17])
-    sp = _t2[0]
-    cp = _t2[1]
-    _t3 = portable_sin_cos(x[(17 + 1)])
-    sy = _t3[0]
-    cy = _t3[1]
-    mat_vb[0] = (cy * cp)
-    mat_vb[1] = (-sy)
-    mat_vb[2] = (cy * sp)
-    mat_vb[3] = (sy * cp)
-    mat_vb[4] = cy
-    mat_vb[5] = (sy * sp)
-    mat_vb[6] = (-sp)
-    mat_vb[7] = 0.0
-    mat_vb[8] = cp
-    for i in range(axes):
-        for _i in range(n):
-            (jacobian + (i) * n)[_i] = 0.0
-        for j in range(3):
-            turned[(i) * 3 + j] = (((mat_vb[(i) * 3 + 0] * c[(j) * 3 + 0]) + (mat_vb[(i) * 3 + 1] * c[(j) * 3 + 1])) + (mat_vb[(i) * 3 + 2] * c[(j) * 3 + 2]))
-        for _i in range(3):
-            (jacobian + (i) * n + 3)[_i] = (turned + (i) * 3)[_i]
-    model_skew_rows(turned, x + 3, 1.0, axes, jacobian, 6)
-    model_skew_rows(mat_vb, point_b, 1.0, axes, jacobian, 9)
-    model_mean_rate_b(state, _t5)
-    rotation_cross(_t5, point_b, _t4)
-    for _i in range(3):
-        mean_b[_i] = (along_b[_i] + _t4[_i])
-    by_mount[0] = ((((-cy) * sp) * mean_b[0]) + ((cy * cp) * mean_b[2]))
-    by_mount[1] = (((((-sy) * cp) * mean_b[0]) - (cy * mean_b[1])) - ((sy * sp) * mean_b[2]))
-    by_mount[2] = 0.0
-    by_mount[3] = ((((-sy) * sp) * mean_b[0]) + ((sy * cp) * mean_b[2]))
-    by_mount[4] = ((((cy * cp) * mean_b[0]) - (sy * mean_b[1])) + ((cy * sp) * mean_b[2]))
-    by_mount[5] = 0.0
-    by_mount[6] = (((-cp) * mean_b[0]) - (sp * mean_b[2]))
-    by_mount[7] = 0.0
-    by_mount[8] = 0.0
-    for i in range(axes):
-        jacobian[(i) * n + 16] = by_mount[(i) * 3 + 0]
-        jacobian[(i) * n + (16 + 1)] = by_mount[(i) * 3 + 1]
-    rotation_times(mat_vb, velocity_b, out)
-    return
-
-# ---------------- fusiond.filter.observations.gnss_position
-
-cdef bint gnss_position_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double* x
-    cdef double to_n[3 * 3]
-    cdef double delay
-    cdef double lever_e[3]
-    cdef double _t1[3]
-    cdef int _i
-    cdef double _t2[3]
-    cdef double _t3[3 * 3]
-    cdef int64_t i
-    cdef double off_e[3]
-    cdef double _t4[3]
-    cdef double _t5
-    x = state.nominal
-    wgs84_mat_ne(x, to_n)
-    model_begin(seen, 3)
-    delay = 0.0
-    if (parameter[4] != 0.0):
-        delay = x[25]
-        gnss_position__calibrated(state, parameter, to_n, seen, _t1)
-        for _i in range(3):
-            lever_e[_i] = _t1[_i]
-    else:
-        model_mat_eb(state, _t3)
-        rotation_times(_t3, parameter, _t2)
-        for _i in range(3):
-            lever_e[_i] = _t2[_i]
-    for i in range(3):
-        for _i in range(3):
-            (seen.jacobian + (i) * n)[_i] = (to_n + (i) * 3)[_i]
-    model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
-    for _i in range(3):
-        off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
-    rotation_times(to_n, off_e, _t4)
-    for _i in range(3):
-        seen.innovation[_i] = _t4[_i]
-    _t5 = row[3]
-    seen.variance[0] = _t5
-    seen.variance[1] = _t5
-    seen.variance[2] = row[4]
-    return True
-
-cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n, Observation* seen, double* out) noexcept nogil:
-    cdef double* x
-    cdef double rotation[3 * 3]
-    cdef double delay
-    cdef double arm_b[3]
-    cdef int _i
-    cdef double swing_b[3]
-    cdef double _t1[3]
-    cdef double turned[3 * 3]
-    cdef double _t2[3]
-    cdef int64_t i
-    cdef double along
-    cdef int64_t j
-    cdef double _t3[3]
-    x = state.nominal
-    model_mat_eb(state, rotation)
-    delay = x[25]
-    for _i in range(3):
-        arm_b[_i] = (lever_b[_i] + (x + 22)[_i])
-    model_rate_b(state, _t1)
-    rotation_cross(_t1, arm_b, swing_b)
-    rotation_matrix_product(to_n, rotation, turned)
-    model_skew_rows(turned, arm_b, (-delay), 3, seen.jacobian, 9)
-    model_mean_rate_b(state, _t2)
-    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 21)
-    for i in range(3):
-        along = 0.0
-        for j in range(3):
-            seen.jacobian[(i) * n + (3 + j)] = (to_n[(i) * 3 + j] * (-delay))
-            seen.jacobian[(i) * n + (21 + j)] += turned[(i) * 3 + j]
-            along += ((to_n[(i) * 3 + j] * x[(3 + j)]) + (turned[(i) * 3 + j] * swing_b[j]))
-        seen.jacobian[(i) * n + 24] = (-along)
-    for _i in range(3):
-        _t3[_i] = (arm_b[_i] - (swing_b[_i] * delay))
-    rotation_times(rotation, _t3, out)
-    return
-
-# ---------------- fusiond.filter.observations.gnss_velocity
-
-cdef double gnss_velocity_lowest_speed(double* row) noexcept nogil:
-    return (sqrt(((row[0] * row[0]) + (row[1] * row[1]))) - (3 * sqrt(row[3])))
-
-cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double* x
-    cdef int64_t axes
-    cdef double to_n[3 * 3]
-    cdef double rotation[3 * 3]
-    cdef double arm_b[3]
-    cdef int _i
-    cdef double swing_e[3]
-    cdef double _t1[3]
-    cdef double _t2[3]
-    cdef double turned[3 * 3]
-    cdef int64_t i
-    cdef double _t3[3]
-    cdef double predicted_n[3]
-    cdef double _t4[3]
-    x = state.nominal
-    axes = (<int64_t>(row[4]))
-    wgs84_mat_ne(x, to_n)
-    model_mat_eb(state, rotation)
-    for _i in range(3):
-        arm_b[_i] = parameter[_i]
-    if (parameter[4] != 0.0):
-        for _i in range(3):
-            arm_b[_i] += (x + 22)[_i]
-    model_rate_b(state, _t2)
-    rotation_cross(_t2, arm_b, _t1)
-    rotation_times(rotation, _t1, swing_e)
-    rotation_matrix_product(to_n, rotation, turned)
-    model_begin(seen, axes)
-    for i in range(axes):
-        for _i in range(3):
-            (seen.jacobian + (i) * n + 3)[_i] = (to_n + (i) * 3)[_i]
-    if (parameter[4] != 0.0):
-        gnss_velocity__gained(state, to_n, turned, seen, _t3)
-        for _i in range(3):
-            swing_e[_i] -= _t3[_i]
-    for i in range(axes):
-        seen.jacobian[(i) * n + 6] += ((-1.0) * ((to_n[(i) * 3 + 1] * swing_e[2]) - (to_n[(i) * 3 + 2] * swing_e[1])))
-        seen.jacobian[(i) * n + (6 + 1)] += ((-1.0) * ((to_n[(i) * 3 + 2] * swing_e[0]) - (to_n[(i) * 3 + 0] * swing_e[2])))
-        seen.jacobian[(i) * n + (6 + 2)] += ((-1.0) * ((to_n[(i) * 3 + 0] * swing_e[1]) - (to_n[(i) * 3 + 1] * swing_e[0])))
-    model_skew_rows(turned, arm_b, 1.0, axes, seen.jacobian, 9)
-    for _i in range(3):
-        _t4[_i] = ((x + 3)[_i] + swing_e[_i])
-    rotation_times(to_n, _t4, predicted_n)
-    for i in range(axes):
-        seen.innovation[i] = (row[i] - predicted_n[i])
-        seen.variance[i] = row[3]
-    return True
-
-cdef void gnss_velocity__gained(State* state, double* to_n, double* turned, Observation* seen, double* out) noexcept nogil:
-    cdef double* x
-    cdef double delay
-    cdef double force_e[3]
-    cdef double _t1[3 * 3]
-    cdef double _t2[3]
-    cdef int _i
-    cdef double rest_e[3]
-    cdef double _t3[3]
-    cdef int64_t i
-    cdef double along
-    cdef int64_t j
-    x = state.nominal
-    delay = (x[25] + x[(25 + 1)])
-    model_mat_eb(state, _t1)
-    for _i in range(3):
-        _t2[_i] = ((state.auxiliary + 36)[_i] - (x + 13)[_i])
-    rotation_times(_t1, _t2, force_e)
-    wgs84_gravity_e(x, rest_e)
-    rest_e[0] += ((2 * 7.292115e-05) * x[(3 + 1)])
-    rest_e[1] -= ((2 * 7.292115e-05) * x[3])
-    model_mean_rate_b(state, _t3)
-    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 21)
-    model_skew_rows(to_n, rest_e, (-delay), seen.m, seen.jacobian, 6)
-    for i in range(seen.m):
-        along = 0.0
-        for j in range(3):
-            along += (to_n[(i) * 3 + j] * (force_e[j] + rest_e[j]))
-            seen.jacobian[(i) * n + (12 + j)] = (turned[(i) * 3 + j] * delay)
-        seen.jacobian[(i) * n + 24] = (-along)
-        seen.jacobian[(i) * n + (24 + 1)] = (-along)
-        seen.jacobian[(i) * n + 3] += (to_n[(i) * 3 + 1] * ((2 * 7.292115e-05) * delay))
-        seen.jacobian[(i) * n + (3 + 1)] -= (to_n[(i) * 3 + 0] * ((2 * 7.292115e-05) * delay))
-    for _i in range(3):
-        out[_i] = ((force_e[_i] + rest_e[_i]) * delay)
-    return
-
-# ---------------- fusiond.filter.observations.wheel_speed
-
-cdef bint wheel_speed_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    return wheel_speed__observe(state, row, parameter, seen, False)
-
-cdef bint wheel_speed_observe_certain(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    return wheel_speed__observe(state, row, parameter, seen, True)
-
-cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Observation* seen, bint certain) noexcept nogil:
-    cdef bint steered
-    cdef double by[3 * n]
-    cdef double velocity_v[3]
-    cdef double forward
-    cdef double sideways
-    cdef double speed
-    cdef int64_t which
-    cdef double scale
-    cdef double* jacobian
-    cdef double track
-    cdef double along
-    cdef double across
-    cdef int _i
-    cdef double reading
-    cdef double variance
-    cdef double reach[n]
-    cdef int64_t k
-    cdef double spread
-    cdef double sure
-    steered = (parameter[4] != 0.0)
-    model_point_velocity_v(state, parameter, (2 if steered else 1), by, velocity_v)
-    forward, sideways = velocity_v[0], velocity_v[1]
-    speed = forward
-    which = (<int64_t>(parameter[6]))
-    scale = (1 + state.nominal[(which + 1)])
-    jacobian = seen.jacobian + (0) * n
-    track = sqrt(((forward * forward) + (sideways * sideways)))
-    if (steered and (track > 0.5)):
-        speed = (track if (forward >= 0) else (-track))
-        along, across = (forward / speed), (sideways / speed)
-        for _i in range(n):
-            jacobian[_i] = (scale * ((along * (by + (0) * n)[_i]) + (across * (by + (1) * n)[_i])))
-    else:
-        for _i in range(n):
-            jacobian[_i] = (scale * (by + (0) * n)[_i])
-    jacobian[which] = speed
-    reading, variance = row[0], row[1]
-    if ((parameter[5] != 0.0) and (reading > 0)):
-        if (certain or (fabs(speed) > 2.0)):
-            if (speed < 0):
-                reading = (-reading)
-        else:
-            memset(reach, 0, n * sizeof(double))
-            for k in range(n):
-                if (jacobian[k] != 0.0):
-                    axpy(reach, jacobian[k], state.covariance + (k) * n)
-            spread = (variance + linear_dot(jacobian, reach))
-            sure = wheel_speed_direction((((reading * scale) * speed) / spread))
-            variance += (((100.0 * reading) * reading) * (1 - (sure * sure)))
-            reading *= sure
-    seen.m = 1
-    seen.innovation[0] = (reading - (scale * speed))
-    seen.variance[0] = variance
-    return True
-
-cdef double wheel_speed_direction(double odds) noexcept nogil:
-    cdef double other
-    cdef double sure
-    other = portable_exp(((-2) * fabs(odds)))
-    sure = ((1 - other) / (1 + other))
-    return ((-sure) if (odds < 0) else sure)
-
-# ---------------- fusiond.filter.observations.barometric_height
-
-cdef bint barometric_height_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double* x
-    cdef double to_n[3 * 3]
-    cdef int _i
-    cdef (double, double, double) _t1
-    cdef double _
-    cdef double height
-    x = state.nominal
-    wgs84_mat_ne(x, to_n)
-    model_begin(seen, 1)
-    for _i in range(3):
-        (seen.jacobian + (0) * n)[_i] = (-(to_n + (2) * 3)[_i])
-    seen.jacobian[(0) * n + 26] = 1.0
-    _t1 = wgs84_geodetic(x)
-    _ = _t1[0]
-    _ = _t1[1]
-    height = _t1[2]
-    seen.innovation[0] = ((row[0] - height) - x[27])
-    seen.variance[0] = row[1]
-    return True
-
-# ---------------- fusiond.filter.observations.gnss_yaw
-
-cdef bint gnss_yaw_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double to_n[3 * 3]
-    cdef double baseline_e[3]
-    cdef double _t1[3 * 3]
-    cdef double baseline_n[3]
-    cdef double north
-    cdef double east
-    cdef double level
-    cdef double by_attitude[3 * n]
-    cdef int64_t i
-    cdef double sine
-    cdef double cosine
-    wgs84_mat_ne(state.nominal, to_n)
-    model_mat_eb(state, _t1)
-    rotation_times(_t1, parameter + 4, baseline_e)
-    rotation_times(to_n, baseline_e, baseline_n)
-    north, east = baseline_n[0], baseline_n[1]
-    level = ((north * north) + (east * east))
-    if (level < portable_square(0.2)):
-        return False
-    memset(by_attitude, 0, 3 * n * sizeof(double))
-    model_skew_rows(to_n, baseline_e, (-1.0), 2, by_attitude, 6)
-    model_begin(seen, 1)
-    for i in range(6, 9):
-        seen.jacobian[(0) * n + i] = (((north * by_attitude[(1) * n + i]) - (east * by_attitude[(0) * n + i])) / level)
-    sine, cosine = row[0], row[1]
-    seen.innovation[0] = portable_atan2(((north * sine) - (east * cosine)), ((north * cosine) + (east * sine)))
-    seen.variance[0] = row[2]
-    return True
-
-# ---------------- fusiond.filter.observations.non_holonomic
-
-cdef bint non_holonomic_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double velocity_v[3]
-    non_holonomic__observe(state, parameter, seen, velocity_v)
-    return (fabs(velocity_v[0]) >= parameter[5])
-
-cdef double non_holonomic_observe_at_any_speed(State* state, double* parameter, Observation* seen) noexcept nogil:
-    cdef double velocity_v[3]
-    non_holonomic__observe(state, parameter, seen, velocity_v)
-    return sqrt(((velocity_v[0] * velocity_v[0]) + (velocity_v[1] * velocity_v[1])))
-
-cdef void non_holonomic__observe(State* state, double* parameter, Observation* seen, double* out) noexcept nogil:
-    cdef double by[3 * n]
-    cdef double velocity_v[3]
-    cdef int64_t i
-    cdef int _i
-    model_point_velocity_v(state, parameter, 3, by, velocity_v)
-    seen.m = 2
-    for i in range(2):
-        for _i in range(n):
-            (seen.jacobian + (i) * n)[_i] = (by + ((1 + i)) * n)[_i]
-        seen.innovation[i] = (-velocity_v[(1 + i)])
-    seen.variance[0], seen.variance[1] = parameter[3], parameter[4]
-    for _i in range(3):
-        out[_i] = velocity_v[_i]
-    return
-
-# ---------------- fusiond.filter.observations.zero_velocity
-
-cdef bint zero_velocity_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef int64_t i
-    model_begin(seen, 3)
-    for i in range(3):
-        seen.jacobian[(i) * n + (3 + i)] = 1.0
-        seen.innovation[i] = (-state.nominal[(3 + i)])
-        seen.variance[i] = parameter[0]
-    return True
-
-# ---------------- fusiond.filter.observations.zero_rotation
-
-cdef bint zero_rotation_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double c[3 * 3]
-    cdef int64_t i
-    cdef double turned
-    model_mat_eb(state, c)
-    model_begin(seen, 3)
-    for i in range(3):
-        seen.jacobian[(i) * n + (9 + i)] = 1.0
-        seen.jacobian[(i) * n + 6] = (c[(1) * 3 + i] * 7.292115e-05)
-        seen.jacobian[(i) * n + (6 + 1)] = (-(c[(0) * 3 + i] * 7.292115e-05))
-        turned = (state.auxiliary[(9 + i)] - state.nominal[(10 + i)])
-        seen.innovation[i] = (turned - (c[(2) * 3 + i] * 7.292115e-05))
-        seen.variance[i] = parameter[0]
-    return True
-
-# ---------------- fusiond.filter.observations
-
-cdef bint observations_observe(State* state, int64_t model, double* row, double* parameter, Observation* seen) noexcept nogil:
-    if model == 0:
-        return gnss_position_observe(state, row, parameter, seen)
-    elif model == 1:
-        return gnss_velocity_observe(state, row, parameter, seen)
-    elif model == 2:
-        return wheel_speed_observe(state, row, parameter, seen)
-    elif model == 3:
-        return barometric_height_observe(state, row, parameter, seen)
-    elif model == 4:
-        return gnss_yaw_observe(state, row, parameter, seen)
-    return False
-
-# ---------------- fusiond.filter.measurement_update
-
-cdef double measurement_update_correlation_factor(double interval, double correlation) noexcept nogil:
-    cdef double _t1
-    cdef double same
-    if ((not (correlation > 0)) or (interval == INFINITY)):
-        return 1.0
-    _t1 = 1e-06
-    same = portable_exp(((-(_t1 if _t1 > interval else interval)) / correlation))
-    if (same < 1):
-        return ((1 + same) / (1 - same))
-    return INFINITY
-
-cdef bint measurement_update_cholesky(double* spread, double* variance, double factor, int64_t m, double* lower) noexcept nogil:
-    cdef int64_t i
-    cdef int64_t j
-    cdef double rest
-    cdef int64_t k
-    for i in range(m):
-        for j in range((i + 1)):
-            rest = spread[(i) * 3 + j]
-            if (i == j):
-                rest += (factor * variance[i])
-            for k in range(j):
-                rest -= (lower[(i) * 3 + k] * lower[(j) * 3 + k])
-            if (i == j):
-                if (not ((variance[i] >= 0) and (0 < rest < INFINITY))):
-                    return False
-                lower[(i) * 3 + i] = sqrt(rest)
-            else:
-                lower[(i) * 3 + j] = (rest / lower[(j) * 3 + j])
-    return True
-
-cdef void measurement_update_project(State* state, Observation* seen, double* across, double* spread) noexcept nogil:
-    cdef int64_t a
-    cdef int _i
-    cdef int64_t k
-    cdef int64_t i
-    cdef double _t1
-    for a in range(seen.m):
-        for _i in range(n):
-            (across + (a) * n)[_i] = 0.0
-        for k in range(n):
-            if (seen.jacobian[(a) * n + k] != 0.0):
-                axpy(across + (a) * n, seen.jacobian[(a) * n + k], state.covariance + (k) * n)
-    for a in range(seen.m):
-        for i in range((a + 1)):
-            _t1 = linear_dot(seen.jacobian + (a) * n, across + (i) * n)
-            spread[(a) * 3 + i] = _t1
-            spread[(i) * 3 + a] = _t1
-
-cdef bint measurement_update_whiten(double* spread, double* innovation, double* variance, int64_t m, double* whitened) noexcept nogil:
-    cdef double lower[3 * 3]
-    cdef int64_t i
-    cdef double rest
-    cdef int64_t k
-    if (not measurement_update_cholesky(spread, variance, 1.0, m, lower)):
-        return False
-    for i in range(m):
-        rest = innovation[i]
-        for k in range(i):
-            rest -= (lower[(i) * 3 + k] * whitened[k])
-        whitened[i] = (rest / lower[(i) * 3 + i])
-    return True
-
-cdef (double, bint) measurement_update_update(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter) noexcept nogil:
-    cdef double across[3 * n]
-    cdef double spread[3 * 3]
-    measurement_update_project(state, seen, across, spread)
-    return measurement_update_update_projected(state, seen, gate, factor, trusted, clutter, across, spread)
-
-cdef (double, bint) measurement_update_update_projected(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, double* across, double* spread) noexcept nogil:
-    cdef int64_t m
-    cdef double* p
-    cdef double whitened[3]
-    cdef double distance
-    cdef int64_t a
-    cdef double ratio
-    cdef double share
-    cdef double lower[3 * 3]
-    cdef double before[n * n]
-    cdef int64_t i
-    cdef int _i
-    cdef double gain[3 * n]
-    cdef double error[n]
-    cdef double mixed
-    cdef double _t1
-    cdef double _t2
-    m = seen.m
-    p = state.covariance
-    if (not measurement_update_whiten(spread, seen.innovation, seen.variance, m, whitened)):
-        return (INFINITY, False)
-    distance = 0.0
-    for a in range(m):
-        distance += (whitened[a] * whitened[a])
-    ratio = (distance / gate)
-    if (not (ratio < INFINITY)):
-        return (INFINITY, False)
-    if ((not trusted) or ((clutter == 0) and (not (ratio <= 1)))):
-        return (ratio, False)
-    share = 1.0
-    if (clutter != 0):
-        share = measurement_update_detection(distance, m, clutter)
-        if (share < 1e-06):
-            return (ratio, False)
-    if (not measurement_update_cholesky(spread, seen.variance, factor, m, lower)):
-        return (ratio, False)
-    if (share < 1):
-        for i in range(n):
-            for _i in range(n):
-                (before + (i) * n)[_i] = (p + (i) * n)[_i]
-    measurement_update__solve(lower, across, m, gain)
-    measurement_update__joseph(p, seen, factor, across, gain)
-    memset(error, 0, n * sizeof(double))
-    for a in range(m):
-        axpy(error, seen.innovation[a], gain + (a) * n)
-    if (share < 1):
-        mixed = (share * (1 - share))
-        for i in range(n):
-            _t1 = (1 - share)
-            _t2 = error[i]
-            for _i in range(n):
-                (p + (i) * n)[_i] = (((share * (p + (i) * n)[_i]) + (_t1 * (before + (i) * n)[_i])) + (mixed * (_t2 * error[_i])))
-        for _i in range(n):
-            error[_i] *= share
-    measurement_update_turn_along(p, error)
-    measurement_update_inject(state, error)
-    return (ratio, (share >= 0.5))
-
-cdef void measurement_update__solve(double* lower, double* across, int64_t m, double* gain) noexcept nogil:
-    cdef int64_t i
-    cdef int _i
-    cdef int64_t k
-    cdef double _t1
-    cdef double _t2
-    for i in range(m):
-        for _i in range(n):
-            (gain + (i) * n)[_i] = (across + (i) * n)[_i]
-        for k in range(i):
-            axpy(gain + (i) * n, (-lower[(i) * 3 + k]), gain + (k) * n)
-        _t1 = lower[(i) * 3 + i]
-        for _i in range(n):
-            (gain + (i) * n)[_i] /= _t1
-    for i in range((m - 1), (-1), (-1)):
-        for k in range((i + 1), m):
-            axpy(gain + (i) * n, (-lower[(k) * 3 + i]), gain + (k) * n)
-        _t2 = lower[(i) * 3 + i]
-        for _i in range(n):
-            (gain + (i) * n)[_i] /= _t2
-
-cdef void measurement_update__joseph(double* p, Observation* seen, double factor, double* across, double* gain) noexcept nogil:
-    cdef int64_t a
-    cdef int _i
-    cdef double kept[3 * n]
-    cdef int64_t k
-    for a in range(seen.m):
-        for _i in range(n):
-            axpy(p + _i * n, (-(across + (a) * n)[_i]), gain + (a) * n)
-    memset(kept, 0, 3 * n * sizeof(double))
-    for a in range(seen.m):
-        for k in range(n):
-            if (seen.jacobian[(a) * n + k] != 0.0):
-                axpy(kept + (a) * n, (-seen.jacobian[(a) * n + k]), p + (k) * n)
-    for a in range(seen.m):
-        axpy(kept + (a) * n, (factor * seen.variance[a]), gain + (a) * n)
-    for a in range(seen.m):
-        for _i in range(n):
-            axpy(p + _i * n, (gain + (a) * n)[_i], kept + (a) * n)
-    linear_mirror(p)
-
-cdef void measurement_update_turn_along(double* p, double* error) noexcept nogil:
-    cdef double turned[6 * n]
-    cdef int64_t phi
-    cdef int64_t block
-    cdef double _t1
-    cdef double _t2
-    cdef int _i
-    cdef double _t3
-    cdef double _t4
-    cdef double _t5
-    cdef double _t6
-    cdef int64_t i
-    cdef double x
-    cdef double y
-    cdef double z
-    phi = 6
-    for block in range(0, 6, 3):
-        _t1 = error[(block + 1)]
-        _t2 = error[(block + 2)]
-        for _i in range(n):
-            (turned + (block) * n)[_i] = ((_t1 * (p + ((phi + 2)) * n)[_i]) - (_t2 * (p + ((phi + 1)) * n)[_i]))
-        _t3 = error[(block + 2)]
-        _t4 = error[block]
-        for _i in range(n):
-            (turned + ((block + 1)) * n)[_i] = ((_t3 * (p + (phi) * n)[_i]) - (_t4 * (p + ((phi + 2)) * n)[_i]))
-        _t5 = error[block]
-        _t6 = error[(block + 1)]
-        for _i in range(n):
-            (turned + ((block + 2)) * n)[_i] = ((_t5 * (p + ((phi + 1)) * n)[_i]) - (_t6 * (p + (phi) * n)[_i]))
-    for i in range(6):
-        axpy(p + (i) * n, (-1.0), turned + (i) * n)
-    for block in range(0, 6, 3):
-        for i in range(6):
-            x, y, z = p[(i) * n + phi], p[(i) * n + (phi + 1)], p[(i) * n + (phi + 2)]
-            p[(i) * n + block] -= ((error[(block + 1)] * z) - (error[(block + 2)] * y))
-            p[(i) * n + (block + 1)] -= ((error[(block + 2)] * x) - (error[block] * z))
-            p[(i) * n + (block + 2)] -= ((error[block] * y) - (error[(block + 1)] * x))
-    for i in range(6):
-        for _i in range((n - i)):
-            (p + i + (i) * n)[_i * n] = (p + (i) * n + i)[_i]
-
-cdef double measurement_update_detection(double distance, int64_t m, double clutter) noexcept nogil:
-    cdef double density
-    cdef double uniform
-    cdef int64_t _a
-    density, uniform = ((1 - clutter) * portable_exp(((-distance) / 2))), clutter
-    for _a in range(m):
-        uniform *= 0.025066282746310002
-    return (density / (density + uniform))
-
-cdef void measurement_update_inject(State* state, double* error) noexcept nogil:
-    cdef double* x
-    cdef int _i
-    cdef int64_t i
-    cdef double _t1[4]
-    cdef double _t2[4]
-    cdef double _t3[4]
-    x = state.nominal
-    for _i in range(3):
-        x[_i] += error[_i]
-    for _i in range(3):
-        (x + 3)[_i] += (error + 3)[_i]
-    for _i in range(3):
-        (x + 10)[_i] += (error + 9)[_i]
-    for _i in range(3):
-        (x + 13)[_i] += (error + 12)[_i]
-    for i in range(15, n):
-        x[(i + 1)] += error[i]
-    rotation_quaternion_exp(error + 6, _t3)
-    rotation_quaternion_multiply(_t3, x + 6, _t2)
-    rotation_normalised(_t2, _t1)
-    for _i in range(4):
-        (x + 6)[_i] = _t1[_i]
-
-cdef void measurement_update_difference(State* one, State* other, double* out) noexcept nogil:
-    cdef double* a
-    cdef double* b
-    cdef double error[n]
-    cdef int _i
-    cdef int64_t i
-    cdef int64_t q
-    cdef double back[4]
-    cdef double turn[4]
-    cdef double twice
-    a = one.nominal
-    b = other.nominal
-    for _i in range(3):
-        error[_i] = (a[_i] - b[_i])
-    for _i in range(3):
-        (error + 3)[_i] = ((a + 3)[_i] - (b + 3)[_i])
-    for _i in range(3):
-        (error + 9)[_i] = ((a + 10)[_i] - (b + 10)[_i])
-    for _i in range(3):
-        (error + 12)[_i] = ((a + 13)[_i] - (b + 13)[_i])
-    for i in range(15, n):
-        error[i] = (a[(i + 1)] - b[(i + 1)])
-    q = 6
-    back[0] = b[q]
-    back[1] = (-b[(q + 1)])
-    back[2] = (-b[(q + 2)])
-    back[3] = (-b[(q + 3)])
-    rotation_quaternion_multiply(a + 6, back, turn)
-    twice = (2.0 if (turn[0] >= 0) else (-2.0))
-    for i in range(3):
-        error[(6 + i)] = (turn[(1 + i)] * twice)
-    for _i in range(n):
-        out[_i] = error[_i]
-    return
-
-# ---------------- fusiond.filter.source_health
-
-cdef void source_health_begin(double* memory) noexcept nogil:
-    cdef int64_t i
-    cdef int _i
-    for i in range(4):
-        memory[(3 + i)] = PRIOR[i]
-    for _i in range(3):
-        (memory + 7)[_i] = 0.0
-    memory[10] = 100.0
-
-cdef bint source_health_observes_sensor(double* spread, double* variance, int64_t m) noexcept nogil:
-    cdef double _t1
-    cdef double total
-    cdef double own
-    cdef int64_t a
-    _t1 = 0.0
-    total = _t1
-    own = _t1
-    for a in range(m):
-        total += spread[(a) * 3 + a]
-        own += variance[a]
-    return (total <= (4.0 * own))
-
-cdef void source_health_judge_repetition(double* memory, int64_t* stamps, bint same, int64_t t_ns) noexcept nogil:
-    cdef double nothing[3]
-    if source_health_is_due(stamps, t_ns, 0.0):
-        memset(nothing, 0, 3 * sizeof(double))
-        source_health_judge(memory, stamps, nothing, 0, same, t_ns)
-
-cdef bint source_health_is_due(int64_t* stamps, int64_t t_ns, double correlation) noexcept nogil:
-    cdef int64_t pause
-    pause = (<int64_t>((2000000000.0 * correlation)))
-    return ((stamps[3] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[3]) >= (pause if pause > 50000000 else 50000000)))
-
-cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened, int64_t m, bint same, int64_t t_ns) noexcept nogil:
-    cdef double elapsed
-    cdef double blurred
-    cdef (double, double, double, double) _t1
-    cdef double nominal
-    cdef double noisy
-    cdef double biased
-    cdef double frozen
-    cdef double total
-    cdef int64_t i
-    if ((((memory[3] + memory[4]) + memory[5]) + memory[6]) == 0):
-        source_health_begin(memory)
-    elapsed = 20.0
-    if (stamps[3] != (<int64_t>-4611686018427387904)):
-        elapsed = ((t_ns - stamps[3]) * 1e-09)
-    stamps[3] = t_ns
-    blurred = (1 - portable_exp(((-elapsed) / 20.0)))
-    source_health__renew_bias(memory, whitened, m)
-    _t1 = source_health_likelihoods(memory, whitened, m, same)
-    nominal = _t1[0]
-    noisy = _t1[1]
-    biased = _t1[2]
-    frozen = _t1[3]
-    memory[3] = ((memory[3] + (blurred * (0.997 - memory[3]))) * nominal)
-    memory[4] = ((memory[4] + (blurred * (0.001 - memory[4]))) * noisy)
-    memory[5] = ((memory[5] + (blurred * (0.001 - memory[5]))) * biased)
-    memory[6] = ((memory[6] + (blurred * (0.001 - memory[6]))) * frozen)
-    total = 0.0
-    for i in range(4):
-        total += memory[(3 + i)]
-    for i in range(4):
-        memory[(3 + i)] = (memory[(3 + i)] / total)
-    source_health__follow_bias(memory, whitened, m)
-
-cdef (double, double, double, double) source_health_likelihoods(double* memory, double* whitened, int64_t m, bint same) noexcept nogil:
-    cdef double _t1
-    cdef double square
-    cdef double off
-    cdef double stretch
-    cdef int64_t a
-    cdef double rest
-    cdef double outlier
-    cdef double good
-    cdef double noisy
-    cdef double biased
-    _t1 = 0.0
-    square = _t1
-    off = _t1
-    stretch = source_health__stretch(memory, m)
-    for a in range(m):
-        square += (whitened[a] * whitened[a])
-        rest = (whitened[a] - (memory[(7 + a)] * stretch))
-        off += (rest * rest)
-    square = (1000.0 if 1000.0 < square else square)
-    outlier = source_health__density(square, 100.0, m)
-    good = (((1 - 0.01) * source_health__density(square, 1.0, m)) + (0.01 * outlier))
-    noisy = (((1 - 0.01) * source_health__density(square, 16.0, m)) + (0.01 * outlier))
-    biased = (((1 - 0.01) * source_health__density(off, (1 + memory[10]), m)) + (0.01 * outlier))
-    if (not same):
-        return (good, noisy, biased, (outlier * 0.001))
-    return ((good * 0.3333333333333333), (noisy * 0.05), (biased * 0.05), outlier)
-
-cdef void source_health__renew_bias(double* memory, double* whitened, int64_t m) noexcept nogil:
-    cdef double _t1
-    cdef double square
-    cdef double off
-    cdef int64_t a
-    cdef double rest
-    cdef int _i
-    _t1 = 0.0
-    square = _t1
-    off = _t1
-    for a in range(m):
-        square += (whitened[a] * whitened[a])
-        rest = (whitened[a] - memory[(7 + a)])
-        off += (rest * rest)
-    if (source_health__density(square, (1 + 100.0), m) > source_health__density(off, (1 + memory[10]), m)):
-        for _i in range(3):
-            (memory + 7)[_i] = 0.0
-        memory[10] = 100.0
-
-cdef double source_health__density(double square, double variance, int64_t m) noexcept nogil:
-    cdef double root
-    cdef double scale
-    cdef int64_t _a
-    root = sqrt(variance)
-    scale = 1.0
-    for _a in range(m):
-        scale *= root
-    return (portable_exp(((-square) / (2 * variance))) / scale)
-
-cdef double source_health__stretch(double* memory, int64_t m) noexcept nogil:
-    cdef double size
-    cdef int64_t a
-    if (memory[10] >= 1.0):
-        return 1.0
-    size = 0.0
-    for a in range(m):
-        size += (memory[(7 + a)] * memory[(7 + a)])
-    size = sqrt(size)
-    return ((3.0 / size) if (1e-09 < size < 3.0) else 1.0)
-
-cdef void source_health__follow_bias(double* memory, double* whitened, int64_t m) noexcept nogil:
-    cdef double variance
-    cdef double gain
-    cdef int64_t a
-    variance = (memory[10] + 0.01)
-    gain = (variance / (variance + 1))
-    for a in range(m):
-        memory[(7 + a)] += (gain * (whitened[a] - memory[(7 + a)]))
-    memory[10] = ((1 - gain) * variance)
-
-cdef bint source_health_is_trusted(double* memory) noexcept nogil:
-    return ((memory[5] + memory[6]) <= 0.5)
-
-cdef double source_health_noise_factor(double* memory, double lowest, double highest) noexcept nogil:
-    cdef double beyond
-    cdef double _t1
-    cdef double _t2
-    beyond = 0.0
-    if (memory[2] > 0.2):
-        beyond = (memory[2] - 0.2)
-    elif (memory[2] < (-0.2)):
-        beyond = (memory[2] + 0.2)
-    _t1 = (1 + beyond)
-    _t2 = (lowest if lowest > _t1 else _t1)
-    return (highest if highest < _t2 else _t2)
-
-cdef double source_health_noisy_factor(double* memory) noexcept nogil:
-    return ((1 + ((16.0 - 1) * memory[4])) if (memory[4] > 0.1) else 1.0)
-
-cdef void source_health_learn(double* memory, double* innovation, double* variance, double* spread, int64_t m, double elapsed) noexcept nogil:
-    cdef double _t1
-    cdef double found
-    cdef double configured
-    cdef double nis
-    cdef int64_t a
-    cdef double square
-    cdef double expected
-    cdef double _t2
-    _t1 = 0.0
-    found = _t1
-    configured = _t1
-    nis = _t1
-    for a in range(m):
-        square, expected = (innovation[a] * innovation[a]), (spread[(a) * 3 + a] + variance[a])
-        nis += (square / expected)
-        _t2 = (25.0 * expected)
-        found += ((_t2 if _t2 < square else square) - spread[(a) * 3 + a])
-        configured += variance[a]
-    memory[16] += ((elapsed / (10.0 + elapsed)) * ((nis / m) - memory[16]))
-    if (configured > 0):
-        memory[2] += ((elapsed / (30.0 + elapsed)) * (((found / configured) - 1) - memory[2]))
-
-cdef double source_health_since_last(int64_t* stamps, int64_t t_ns) noexcept nogil:
-    if (stamps[0] == (<int64_t>-4611686018427387904)):
-        return 0.0
-    return ((t_ns - stamps[0]) * 1e-09)
-
-cdef bint source_health_arrive(double* memory, int64_t* stamps, double* values, int64_t t_ns) noexcept nogil:
-    cdef double total
-    cdef bint same
-    cdef double elapsed
-    cdef double share
-    total = ((values[0] + values[1]) + values[2])
-    same = ((stamps[0] != (<int64_t>-4611686018427387904)) and (total == memory[11]))
-    memory[11] = total
-    elapsed = source_health_since_last(stamps, t_ns)
-    if (elapsed > 0):
-        share = (0.05 if (memory[12] > 0) else 1.0)
-        memory[12] += (share * ((10.0 if 10.0 < elapsed else elapsed) - memory[12]))
-    return same
-
-cdef bint source_health_moved(double* memory, double* innovation, double* variance, int64_t m, double gate) noexcept nogil:
-    cdef double total
-    cdef int64_t a
-    cdef double step
-    total = 0.0
-    for a in range(m):
-        step = (innovation[a] - memory[(13 + a)])
-        total += ((step * step) / (2 * variance[a]))
-        memory[(13 + a)] = innovation[a]
-    return (not (total <= gate))
-
-# ---------------- fusiond.filter.motion_constraints
-
-cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b, double dt, Plan* plan) noexcept nogil:
-    cdef double* auxiliary
-    cdef double smooth
-    cdef int _i
-    cdef double share
-    cdef double weight
-    cdef double step
-    cdef double off[3]
-    auxiliary = state.auxiliary
-    smooth = ((1 - portable_exp(((-dt) / 0.08))) if (auxiliary[20] > 0) else 1.0)
-    for _i in range(3):
-        (auxiliary + 36)[_i] += (smooth * (force_b[_i] - (auxiliary + 36)[_i]))
-    share = (1 - portable_exp(((-dt) / 0.5)))
-    weight = (auxiliary[20] + (share * (1 - auxiliary[20])))
-    auxiliary[20] = weight
-    step = ((share / weight) if (weight > 0) else 1.0)
-    for _i in range(3):
-        off[_i] = (force_b[_i] - (auxiliary + 12)[_i])
-    for _i in range(3):
-        (auxiliary + 12)[_i] += (step * off[_i])
-    auxiliary[18] = motion_constraints__scatter(auxiliary[18], off, step)
-    for _i in range(3):
-        off[_i] = (rate_b[_i] - (auxiliary + 15)[_i])
-    for _i in range(3):
-        (auxiliary + 15)[_i] += (step * off[_i])
-    auxiliary[19] = motion_constraints__scatter(auxiliary[19], off, step)
-    if (not motion_constraints_stands(state, plan)):
-        state.stamps[3] = (<int64_t>-4611686018427387904)
-    elif (state.stamps[3] == (<int64_t>-4611686018427387904)):
-        state.stamps[3] = state.stamps[0]
-
-cdef double motion_constraints__scatter(double before, double* off, double step) noexcept nogil:
-    return ((1 - step) * (before + (step * (((off[0] * off[0]) + (off[1] * off[1])) + (off[2] * off[2])))))
-
-cdef bint motion_constraints_carried(State* state, double wheel_speed, Plan* plan) noexcept nogil:
-    cdef int64_t i
-    cdef int64_t _k1
-    cdef bint fresh
-    if (not (fabs(wheel_speed) <= plan.still_wheel)):
-        return False
-    for _k1 in range(plan.velocities_count):
-        i = plan.velocities[_k1]
-        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 2000000000)
-        if (fresh and (state.memory[(i) * MEMORY_SIZE + 0] > 1.0) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
-            return True
-    return False
-
-cdef bint motion_constraints_rests(State* state, Plan* plan) noexcept nogil:
-    cdef bint heard
-    cdef int64_t i
-    cdef int64_t _k1
-    heard = False
-    for _k1 in range(plan.wheels_count):
-        i = plan.wheels[_k1]
-        if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
-            heard = True
-            if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= plan.still_wheel)):
-                return False
-    return heard
-
-cdef bint motion_constraints_is_carried(State* state, Plan* plan) noexcept nogil:
-    return (motion_constraints_rests(state, plan) and motion_constraints_carried(state, 0.0, plan))
-
-cdef bint motion_constraints_disputed(State* state, int64_t velocity, Plan* plan) noexcept nogil:
-    return ((velocity >= 0) and (state.memory[(velocity) * MEMORY_SIZE + 0] > 0.0) and motion_constraints_rests(state, plan))
-
-cdef bint motion_constraints_stands(State* state, Plan* plan) noexcept nogil:
-    cdef double* auxiliary
-    cdef bint wheeled
-    cdef double interval
-    cdef double own
-    cdef double _t1
-    cdef double _t2
-    cdef double _t3
-    cdef double _t4
-    auxiliary = state.auxiliary
-    if ((not plan.standstill) or (auxiliary[20] < 0.8)):
-        return False
-    wheeled = (plan.wheels_count > 0)
-    interval = (state.memory[(plan.imu_source) * MEMORY_SIZE + 12] if wheeled else 0.0)
-    own = ((6.75 / interval) if (interval > 0) else 0.0)
-    _t1 = portable_square(plan.still_accel)
-    _t2 = (own * plan.noise.accel)
-    if (auxiliary[18] > (_t2 if _t2 > _t1 else _t1)):
-        return False
-    _t3 = portable_square(plan.still_gyro)
-    _t4 = (own * plan.noise.gyro)
-    if (auxiliary[19] > (_t4 if _t4 > _t3 else _t3)):
-        return False
-    return (((not wheeled) or motion_constraints_rests(state, plan)) and (not motion_constraints_carried(state, 0.0, plan)))
-
-cdef void motion_constraints_constrain(State* state, Plan* plan) noexcept nogil:
-    cdef (bint, bint) _t1
-    cdef bint still
-    cdef bint rolling
-    _t1 = motion_constraints_constraints_due(state, plan)
-    still = _t1[0]
-    rolling = _t1[1]
-    if (still and motion_constraints__apply(state, 1, plan, plan.zero_velocity_factor)):
-        motion_constraints__apply(state, 2, plan, 1.0)
-    elif rolling:
-        motion_constraints__apply(state, 0, plan, 1.0)
-
-cdef (bint, bint) motion_constraints_constraints_due(State* state, Plan* plan) noexcept nogil:
-    cdef int64_t now
-    cdef bint still
-    now = state.stamps[0]
-    if ((now - state.stamps[2]) < plan.constraint_interval_ns):
-        return (False, False)
-    state.stamps[2] = now
-    still = ((state.stamps[3] != (<int64_t>-4611686018427387904)) and ((now - state.stamps[3]) >= plan.still_after_ns))
-    return (still, (plan.non_holonomic and (not motion_constraints_is_carried(state, plan))))
-
-cdef bint motion_constraints_observe_constraint(State* state, int64_t which, Plan* plan, Observation* seen) noexcept nogil:
-    if (which == 1):
-        return zero_velocity_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
-    if (which == 2):
-        return zero_rotation_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
-    return non_holonomic_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
-
-cdef bint motion_constraints__apply(State* state, int64_t which, Plan* plan, double factor) noexcept nogil:
-    cdef Observation seen
-    cdef (double, bint) _t1
-    cdef double ratio
-    cdef bint fused
-    if (not motion_constraints_observe_constraint(state, which, plan, &seen)):
-        return False
-    model_with_rate_noise(state, &seen)
-    _t1 = measurement_update_update(state, &seen, plan.gates[seen.m], factor, True, 0.0)
-    ratio = _t1[0]
-    fused = _t1[1]
-    state.auxiliary[(32 + which)] = ratio
-    if fused:
-        state.stamps[(11 + which)] += 1
-    else:
-        state.stamps[(14 + which)] += 1
-    return fused
-
-# ---------------- fusiond.filter.measurement
-
-cdef void measurement_share_noise(State* state, Observation* seen, double* parameter) noexcept nogil:
-    cdef int64_t a
-    for a in range(seen.m):
-        seen.variance[a] *= parameter[10]
-    model_with_rate_noise(state, seen)
-
-cdef void measurement_remember(double* memory, int64_t model, double* values) noexcept nogil:
-    if (model == 2):
-        memory[0] = values[0]
-    elif (model == 1):
-        memory[0] = gnss_velocity_lowest_speed(values)
-
-cdef double measurement_factor_of(int64_t* stamps, int64_t model, double* values, double* parameter, int64_t t_ns) noexcept nogil:
-    if (stamps[1] == (<int64_t>-4611686018427387904)):
-        return 1.0
-    return measurement_update_correlation_factor(((t_ns - stamps[1]) * 1e-09), measurement_correlation_of(model, values, parameter))
-
-cdef double measurement_correlation_of(int64_t model, double* values, double* parameter) noexcept nogil:
-    return (values[2] if (model == 2) else parameter[3])
-
-cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil:
-    cdef int64_t source
-    cdef int64_t t_ns
-    cdef int64_t model
-    cdef double* values
-    cdef double* parameter
-    cdef double* memory
-    cdef int64_t* stamps
-    cdef double elapsed
-    cdef bint same
-    cdef Observation seen
-    cdef int64_t m
-    cdef double across[3 * n]
-    cdef double spread[3 * 3]
-    cdef double given[3]
-    cdef double learnt[3]
-    cdef double factor
-    cdef int64_t a
-    cdef double weight
-    cdef int64_t companion
-    cdef bint doubtful
-    cdef double whitened[3]
-    cdef bint known
-    cdef bint trusted
-    cdef double noisy
-    cdef (double, bint) _t1
-    cdef double ratio
-    cdef bint fused
-    cdef double _t2
-    cdef int64_t _t3
-    source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
-    model = plan.models[source]
-    values = row.values
-    parameter = plan.parameters + (source) * PARAMETERS
-    memory = state.memory + (source) * MEMORY_SIZE
-    stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
-    elapsed = source_health_since_last(stamps, t_ns)
-    same = source_health_arrive(memory, stamps, values, t_ns)
-    measurement_remember(memory, model, values)
-    if (not observations_observe(state, model, values, parameter, &seen)):
-        return False
-    m = seen.m
-    measurement_update_project(state, &seen, across, spread)
-    measurement_share_noise(state, &seen, parameter)
-    factor = source_health_noise_factor(memory, parameter[8], parameter[9])
-    for a in range(m):
-        given[a] = seen.variance[a]
-        learnt[a] = (given[a] * factor)
-        row.innovation[a] = seen.innovation[a]
-        row.variance[a] = (spread[(a) * 3 + a] + learnt[a])
-    weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
-    if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
-        stamps[1] = (<int64_t>-4611686018427387904)
-        stamps[5] = t_ns
-        source_health_begin(memory)
-    companion = (<int64_t>(parameter[11]))
-    doubtful = motion_constraints_disputed(state, (source if (model == 1) else companion), plan)
-    if (not doubtful):
-        if source_health_is_due(stamps, t_ns, measurement_correlation_of(model, values, parameter)):
-            known = ((stamps[1] != (<int64_t>-4611686018427387904)) and source_health_observes_sensor(spread, learnt, m))
-            if (known and measurement_update_whiten(spread, seen.innovation, learnt, m, whitened)):
-                source_health_judge(memory, stamps, whitened, m, same, t_ns)
-        source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
-    trusted = (source_health_is_trusted(memory) and ((companion < 0) or source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))
-    if ((model == 2) and trusted):
-        trusted = (not motion_constraints_carried(state, memory[0], plan))
-    noisy = source_health_noisy_factor(memory)
-    for a in range(m):
-        seen.variance[a] = (learnt[a] * noisy)
-    _t1 = measurement_update_update_projected(state, &seen, plan.gates[m], weight, trusted, parameter[12], across, spread)
-    ratio = _t1[0]
-    fused = _t1[1]
-    _t2 = ratio
-    row.ratio = _t2
-    memory[1] = _t2
-    if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, plan)):
-        measurement__reset(state, source, &seen, (<int64_t>(parameter[13])))
-        source_health_begin(memory)
-        fused = True
-    if fused:
-        _t3 = (<int64_t>-4611686018427387904)
-        stamps[2] = _t3
-        stamps[4] = _t3
-        stamps[1] = t_ns
-        if (model == 0):
-            state.stamps[4] = t_ns
-    elif (stamps[2] == (<int64_t>-4611686018427387904)):
-        stamps[2] = t_ns
-    return fused
-
-cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Plan* plan) noexcept nogil:
-    cdef double* memory
-    cdef int64_t* stamps
-    cdef bint off
-    cdef int64_t wait
-    cdef int64_t companion
-    cdef bint returns
-    memory = state.memory + (source) * MEMORY_SIZE
-    stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
-    off = source_health_moved(memory, seen.innovation, seen.variance, seen.m, plan.gates[seen.m])
-    if (off or (stamps[4] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>5000000000))):
-        stamps[4] = t_ns
-        return False
-    wait = plan.gnss_reset_ns
-    companion = (<int64_t>(plan.parameters[(source) * PARAMETERS + 11]))
-    returns = ((stamps[1] == (<int64_t>-4611686018427387904)) or ((stamps[4] - stamps[5]) <= (<int64_t>10000000000)))
-    if ((returns and (memory[1] <= 9.0)) or motion_constraints_is_carried(state, plan)):
-        wait = plan.gnss_return_ns
-    elif ((plan.models[source] == 1) or ((companion >= 0) and (not source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))):
-        wait = (6 * wait)
-    return ((t_ns - stamps[4]) >= wait)
-
-cdef void measurement__reset(State* state, int64_t source, Observation* seen, int64_t block) noexcept nogil:
-    if (block == 26):
-        measurement__reset_offset(state, seen)
-        return
-    measurement__reset_block(state, seen, block)
-    state.stamps[10] += 1
-    state.stamps[18] = 4
-    state.stamps[19] = source
-
-cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
-    cdef double* x
-    cdef double* p
-    cdef int64_t m
-    cdef double to_n[3 * 3]
-    cdef double half[3 * 3]
-    cdef double spread[3 * 3]
-    cdef int64_t i
-    cdef int64_t k
-    cdef int64_t j
-    cdef int _i
-    x = state.nominal
-    p = state.covariance
-    m = seen.m
-    wgs84_mat_ne(x, to_n)
-    memset(half, 0, 3 * 3 * sizeof(double))
-    memset(spread, 0, 3 * 3 * sizeof(double))
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                half[(i) * 3 + j] += (to_n[(i) * 3 + k] * p[((block + k)) * n + (block + j)])
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                spread[(i) * 3 + j] += (half[(i) * 3 + k] * to_n[(j) * 3 + k])
-    for i in range(3):
-        for j in range(3):
-            if ((i < m) or (j < m)):
-                spread[(i) * 3 + j] = (seen.variance[i] if (i == j) else 0.0)
-    for i in range(3):
-        for k in range(m):
-            x[(block + i)] += (to_n[(k) * 3 + i] * seen.innovation[k])
-        for _i in range(n):
-            (p + ((block + i)) * n)[_i] = 0.0
-        for _i in range(n):
-            (p + (block + i))[_i * n] = 0.0
-        for _i in range(3):
-            (half + (i) * 3)[_i] = 0.0
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                half[(i) * 3 + j] += (to_n[(k) * 3 + i] * spread[(k) * 3 + j])
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                p[((block + i)) * n + (block + j)] += (half[(i) * 3 + k] * to_n[(k) * 3 + j])
-
-cdef void measurement__reset_offset(State* state, Observation* seen) noexcept nogil:
-    cdef double* p
-    cdef int64_t offset
-    cdef int _i
-    cdef double cross[n]
-    cdef int64_t k
-    cdef double variance
-    p = state.covariance
-    offset = 26
-    state.nominal[27] += seen.innovation[0]
-    for _i in range(n):
-        (p + (offset) * n)[_i] = 0.0
-    for _i in range(n):
-        (p + offset)[_i * n] = 0.0
-    memset(cross, 0, n * sizeof(double))
-    for k in range(n):
-        if (seen.jacobian[(0) * n + k] != 0.0):
-            axpy(cross, (-seen.jacobian[(0) * n + k]), p + (k) * n)
-    for _i in range(n):
-        (p + (offset) * n)[_i] = cross[_i]
-    for _i in range(n):
-        (p + offset)[_i * n] = cross[_i]
-    variance = seen.variance[0]
-    for k in range(n):
-        variance += (-(cross[k] * seen.jacobian[(0) * n + k]))
-    p[(offset) * n + offset] = variance
-
-# ---------------- fusiond.filter.heading_bank
-
-cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double factor, double* spread) noexcept nogil:
-    cdef int64_t m
-    cdef double lower[3 * 3]
-    cdef double widened[3]
-    cdef double whitened[3]
-    cdef int64_t a
-    cdef double square
-    cdef double size
-    cdef double lowest
-    cdef int64_t _a
-    m = seen.m
-    for a in range(m):
-        widened[a] = (factor * seen.variance[a])
-    if ((not measurement_update_cholesky(spread, widened, 1.0, m, lower)) or (not measurement_update_whiten(spread, seen.innovation, widened, m, whitened))):
-        return
-    square, size = 0.0, 1.0
-    for a in range(m):
-        square += (whitened[a] * whitened[a])
-        size *= lower[(a) * 3 + a]
-    lowest = portable_exp(((-(1000.0 if 1000.0 < square else square)) / (2 * 100.0)))
-    for _a in range(m):
-        lowest /= sqrt(100.0)
-    state.bank[(i) * BLOCK + 0] *= ((((1 - 0.01) * portable_exp(((-square) / 2))) + (0.01 * lowest)) / size)
-
-cdef void heading_bank_take(State* state, int64_t i, State* hypothesis, Observation* seen, double factor, Plan* plan, bint weighed) noexcept nogil:
-    cdef double across[3 * n]
-    cdef double spread[3 * 3]
-    measurement_update_project(hypothesis, seen, across, spread)
-    if weighed:
-        heading_bank_weigh(state, i, seen, factor, spread)
-    measurement_update_update_projected(hypothesis, seen, plan.gates[seen.m], factor, True, 0.01, across, spread)
-
-cdef void heading_bank_measure(State* state, int64_t i, int64_t model, double* values, double* parameter, double factor, Plan* plan) noexcept nogil:
-    cdef State hypothesis
-    cdef Observation seen
-    cdef double across[3 * n]
-    cdef double spread[3 * 3]
-    hypothesis = hypothesis_of(state, i)
-    if (model == 2):
-        wheel_speed_observe_certain(&hypothesis, values, parameter, &seen)
-        measurement_share_noise(&hypothesis, &seen, parameter)
-        measurement_update_project(&hypothesis, &seen, across, spread)
-        heading_bank_weigh(state, i, &seen, factor, spread)
-    if observations_observe(&hypothesis, model, values, parameter, &seen):
-        measurement_share_noise(&hypothesis, &seen, parameter)
-        heading_bank_take(state, i, &hypothesis, &seen, factor, plan, (model != 2))
-
-cdef void heading_bank_constrain(State* state, Plan* plan) noexcept nogil:
-    cdef (bint, bint) _t1
-    cdef bint still
-    cdef bint rolling
-    cdef Observation seen
-    cdef int64_t i
-    cdef State hypothesis
-    _t1 = motion_constraints_constraints_due(state, plan)
-    still = _t1[0]
-    rolling = _t1[1]
-    if (not (still or rolling)):
-        return
-    for i in range(13):
-        if (still and (state.bank[(i) * BLOCK + 0] > 0)):
-            hypothesis = hypothesis_of(state, i)
-            motion_constraints_observe_constraint(&hypothesis, 1, plan, &seen)
-            model_with_rate_noise(&hypothesis, &seen)
-            heading_bank_take(state, i, &hypothesis, &seen, plan.zero_velocity_factor, plan, True)
-            motion_constraints_observe_constraint(&hypothesis, 2, plan, &seen)
-            model_with_rate_noise(&hypothesis, &seen)
-            heading_bank_take(state, i, &hypothesis, &seen, 1.0, plan, True)
-    if (rolling and (not still)):
-        heading_bank__roll(state, plan)
-    heading_bank_normalise(state)
-
-cdef void heading_bank__roll(State* state, Plan* plan) noexcept nogil:
-    cdef double* parameter
-    cdef Observation seen
-    cdef double fastest
-    cdef int64_t i
-    cdef State hypothesis
-    cdef double _t1
-    parameter = plan.constraints + (0) * PARAMETERS
-    fastest = 0.0
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            hypothesis = hypothesis_of(state, i)
-            _t1 = non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
-            fastest = (_t1 if _t1 > fastest else fastest)
-    if (fastest < parameter[5]):
-        return
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            hypothesis = hypothesis_of(state, i)
-            non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
-            model_with_rate_noise(&hypothesis, &seen)
-            heading_bank_take(state, i, &hypothesis, &seen, 1.0, plan, True)
-
-cdef void heading_bank_normalise(State* state) noexcept nogil:
-    cdef double total
-    cdef int64_t i
-    total = 0.0
-    for i in range(13):
-        total += state.bank[(i) * BLOCK + 0]
-    for i in range(13):
-        state.bank[(i) * BLOCK + 0] = ((state.bank[(i) * BLOCK + 0] / total) if (total > 0) else 0.0)
-        if (state.bank[(i) * BLOCK + 0] < 1e-09):
-            state.bank[(i) * BLOCK + 0] = 0.0
-
-cdef void heading_bank_settle(State* state, Plan* plan) noexcept nogil:
-    cdef int64_t best
-    cdef int64_t i
-    cdef State likeliest
-    cdef double to_n[3 * 3]
-    cdef double* down
-    cdef double errors[13 * n]
-    cdef double turns[13]
-    cdef double _t1
-    cdef double mean
-    cdef double spread
-    cdef double doubt
-    cdef State hypothesis
-    cdef double _t2[n]
-    cdef int _i
-    cdef double* turn
-    cdef double own
-    heading_bank_normalise(state)
-    best = (-1)
-    for i in range(13):
-        if ((state.bank[(i) * BLOCK + 0] > 0) and ((best < 0) or (state.bank[(i) * BLOCK + 0] > state.bank[(best) * BLOCK + 0]))):
-            best = i
-    if (best < 0):
-        return
-    likeliest = hypothesis_of(state, best)
-    wgs84_mat_ne(likeliest.nominal, to_n)
-    down = to_n + (2) * 3
-    memset(errors, 0, 13 * n * sizeof(double))
-    memset(turns, 0, 13 * sizeof(double))
-    _t1 = 0.0
-    mean = _t1
-    spread = _t1
-    doubt = _t1
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            hypothesis = hypothesis_of(state, i)
-            measurement_update_difference(&hypothesis, &likeliest, _t2)
-            for _i in range(n):
-                (errors + (i) * n)[_i] = _t2[_i]
-            turn = errors + (i) * n + 6
-            turns[i] = (((down[0] * turn[0]) + (down[1] * turn[1])) + (down[2] * turn[2]))
-            mean += (state.bank[(i) * BLOCK + 0] * turns[i])
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            hypothesis = hypothesis_of(state, i)
-            own = heading_bank__variance_along(&hypothesis, down[0], down[1], down[2])
-            spread += (state.bank[(i) * BLOCK + 0] * (own + ((turns[i] - mean) * (turns[i] - mean))))
-            if (fabs(turns[i]) > 0.5235987755982988):
-                doubt += state.bank[(i) * BLOCK + 0]
-    if ((spread <= plan.heading_variance) and (doubt <= 0.0001)):
-        heading_bank__collapse(state, best, errors)
-
-cdef double heading_bank__variance_along(State* hypothesis, double x, double y, double z) noexcept nogil:
-    cdef double* p
-    cdef int64_t phi
-    cdef double turned[3]
-    cdef int64_t a
-    p = hypothesis.covariance
-    phi = 6
-    for a in range(3):
-        turned[a] = (((p[((phi + a)) * n + phi] * x) + (p[((phi + a)) * n + (phi + 1)] * y)) + (p[((phi + a)) * n + (phi + 2)] * z))
-    return (((x * turned[0]) + (y * turned[1])) + (z * turned[2]))
-
-cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noexcept nogil:
-    cdef double* p
-    cdef double mean[n]
-    cdef int64_t i
-    cdef int _i
-    cdef double weight
-    cdef State hypothesis
-    cdef int64_t j
-    cdef double _t1
-    cdef double _t2
-    cdef State likeliest
-    cdef int64_t source
-    p = state.covariance
-    memset(mean, 0, n * sizeof(double))
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            axpy(mean, state.bank[(i) * BLOCK + 0], errors + (i) * n)
-    for _i in range(n * n):
-        p[_i] = 0.0
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            weight = state.bank[(i) * BLOCK + 0]
-            hypothesis = hypothesis_of(state, i)
-            for j in range(n):
-                _t1 = (errors[(i) * n + j] - mean[j])
-                _t2 = (errors[(i) * n + j] - mean[j])
-                for _i in range(n):
-                    (p + (j) * n)[_i] += (weight * ((hypothesis.covariance + (j) * n)[_i] + (_t2 * ((errors + (i) * n)[_i] - mean[_i]))))
-    linear_mirror(p)
-    likeliest = hypothesis_of(state, best)
-    for _i in range(NOMINAL_SIZE):
-        state.nominal[_i] = likeliest.nominal[_i]
-    measurement_update_inject(state, mean)
-    for _i in range(HYPOTHESES * BLOCK):
-        state.bank[_i] = 0.0
-    state.stamps[9] = 2
-    if (state.stamps[20] == 1):
-        state.stamps[10] += 1
-        state.stamps[18] = 5
-    for source in range(state.sources):
-        state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
-
-# ---------------- fusiond.filter.initial_alignment
-
-cdef void initial_alignment_gather_motion(State* state, Row* row, Plan* plan) noexcept nogil:
-    cdef int64_t* stamps
-    cdef double* a
-    cdef double* values
-    cdef int64_t t_ns
-    cdef int64_t source
-    cdef int64_t i
-    cdef double _t1
-    cdef double _t2
-    cdef bint still
-    cdef int _i
-    stamps = state.stamps
-    a = state.auxiliary
-    values = row.values
-    t_ns, source = (<int64_t>row.t_ns), (<int64_t>row.source)
-    stamps[0] = t_ns
-    if (plan.models[source] == 2):
-        state.memory[(source) * MEMORY_SIZE + 0] = values[0]
-    if (plan.models[source] != -1):
-        return
-    source_health_arrive(state.memory + (source) * MEMORY_SIZE, state.source_stamps + (source) * SOURCE_STAMPS_SIZE, values, t_ns)
-    if (stamps[1] != (<int64_t>-4611686018427387904)):
-        motion_constraints_watch(state, values, values + 3, ((t_ns - stamps[1]) * 1e-09), plan)
-    stamps[1] = t_ns
-    for i in range(3):
-        _t1 = values[i]
-        a[(0 + i)] = _t1
-        a[(6 + i)] = _t1
-        _t2 = values[(3 + i)]
-        a[(3 + i)] = _t2
-        a[(9 + i)] = _t2
-    still = ((stamps[3] != (<int64_t>-4611686018427387904)) and ((t_ns - stamps[3]) >= plan.still_after_ns))
-    if (still and (not (initial_alignment__gnss_speed(state) >= plan.course_speed))):
-        for _i in range(3):
-            (a + 21)[_i] = (a + 15)[_i]
-        stamps[7] = t_ns
-
-cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
-    cdef int64_t first
-    cdef double north
-    cdef double east
-    first = state.stamps[5]
-    if ((first == (<int64_t>-4611686018427387904)) or ((state.stamps[0] - first) > (<int64_t>3000000000))):
-        return NAN
-    north, east = state.auxiliary[24], state.auxiliary[(24 + 1)]
-    return sqrt((portable_square(north) + portable_square(east)))
-
-# ---------------- fusiond.filter.north_east_down
-
-cdef void north_east_down_answer(double* nominal, double* covariance, double* out) noexcept nogil:
-    cdef double found[91]
-    cdef double to_n[3 * 3]
-    cdef (double, double, double) _t1
-    cdef double _t2[3]
-    cdef int _i
-    cdef double _t3[4]
-    cdef double _t4[3 * 3]
-    cdef double _t5[3 * 3]
-    cdef double turned[3 * 3]
-    cdef int64_t a
-    cdef int64_t b
-    cdef int64_t i
-    cdef int64_t j
-    wgs84_mat_ne(nominal, to_n)
-    _t1 = wgs84_geodetic(nominal)
-    found[0] = _t1[0]
-    found[1] = _t1[1]
-    found[2] = _t1[2]
-    rotation_times(to_n, nominal + 3, _t2)
-    for _i in range(3):
-        (found + 3)[_i] = _t2[_i]
-    rotation_matrix(nominal + 6, _t5)
-    rotation_matrix_product(to_n, _t5, _t4)
-    rotation_quaternion(_t4, _t3)
-    for _i in range(4):
-        (found + 6)[_i] = _t3[_i]
-    for a in range(0, 9, 3):
-        for b in range(0, 9, 3):
-            for i in range(3):
-                for j in range(3):
-                    turned[(i) * 3 + j] = (((to_n[(i) * 3 + 0] * covariance[(a) * n + (b + j)]) + (to_n[(i) * 3 + 1] * covariance[((a + 1)) * n + (b + j)])) + (to_n[(i) * 3 + 2] * covariance[((a + 2)) * n + (b + j)]))
-            for i in range(3):
-                for j in range(3):
-                    found[(((10 + (9 * (a + i))) + b) + j)] = (((turned[(i) * 3 + 0] * to_n[(j) * 3 + 0]) + (turned[(i) * 3 + 1] * to_n[(j) * 3 + 1])) + (turned[(i) * 3 + 2] * to_n[(j) * 3 + 2]))
-    for _i in range(ANSWER_SIZE):
-        out[_i] = found[_i]
-    return
-
-# ---------------- fusiond.filter.step
-
-cdef void step_step(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil:
-    cdef int64_t t_ns
-    cdef int64_t source
-    cdef bint coasted
-    cdef double variance
-    cdef bint lost
-    t_ns, source = (<int64_t>row.t_ns), (<int64_t>row.source)
-    step__forget_judgement(row)
-    if (state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] == t_ns):
-        row.outcome = 3
-        return
-    row.outcome = 0
-    if (state.stamps[9] == 1):
-        initial_alignment_gather_motion(state, row, plan)
-    elif (state.stamps[9] == 3):
-        step__choose(state, row, imu, plan)
-    else:
-        coasted = step_coasts(state, t_ns, plan)
-        step_advance(state, t_ns, imu, plan)
-        if (plan.models[source] == -1):
-            step_keep_sample(state, row, plan)
-            motion_constraints_constrain(state, plan)
-        else:
-            variance = (step_yaw_variance(state) if coasted else 0.0)
-            lost = (variance > portable_square(0.20943951023931956))
-            if (not (step__measure_lost(state, row, plan, variance) if lost else measurement_measure(state, row, plan))):
-                row.outcome = 1
-        step_guard(state)
-    state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
-
-cdef bint step_can_step(State* state, Row* row, Plan* plan) noexcept nogil:
-    cdef int64_t* stamps
-    cdef int64_t phase
-    cdef int64_t t_ns
-    cdef int64_t model
-    cdef double grown
-    stamps = state.stamps
-    phase = (<int64_t>(state.stamps[9]))
-    t_ns, model = (<int64_t>row.t_ns), (<int64_t>(plan.models[(<int64_t>row.source)]))
-    if ((phase == 0) or ((t_ns - stamps[0]) > plan.restart_gap_ns)):
-        return False
-    if (phase == 1):
-        return (model != 0 and model != 1)
-    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, plan)):
-        grown = (portable_square(0.3) * ((t_ns - stamps[0]) * 1e-09))
-        return (not ((step_yaw_variance(state) + grown) > (portable_square(0.20943951023931956) / 2)))
-    return True
-
-cdef void step__forget_judgement(Row* row) noexcept nogil:
-    cdef int _i
-    row.ratio = 0.0
-    for _i in range(3):
-        row.innovation[_i] = 0.0
-    for _i in range(3):
-        row.variance[_i] = 0.0
-
-cdef bint step__measure_lost(State* state, Row* row, Plan* plan, double variance) noexcept nogil:
-    cdef bint fused
-    cdef double gained
-    cdef double* r
-    cdef int64_t phi
-    cdef int64_t i
-    cdef int64_t j
-    fused = measurement_measure(state, row, plan)
-    gained = (variance - step_yaw_variance(state))
-    if (gained > 0):
-        r = state.nominal
-        phi = 6
-        gained /= (((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2]))
-        for i in range(3):
-            for j in range(3):
-                state.covariance[((phi + i)) * n + (phi + j)] += ((r[i] * r[j]) * gained)
-    return fused
-
-cdef bint step_coasts(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
-    return ((t_ns - state.stamps[1]) > plan.imu_gap_ns)
-
-cdef bint step_settles(State* state, int64_t source, Plan* plan) noexcept nogil:
-    return ((plan.models[source] == -1) or step_coasts(state, state.stamps[0], plan))
-
-cdef double step_yaw_variance(State* state) noexcept nogil:
-    cdef double* r
-    cdef int64_t phi
-    cdef double total
-    cdef int64_t i
-    cdef int64_t j
-    r = state.nominal
-    phi = 6
-    total = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += ((r[i] * state.covariance[((phi + i)) * n + (phi + j)]) * r[j])
-    return (total / (((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2])))
-
-cdef void step_advance(State* state, int64_t t_ns, Row* imu, Plan* plan) noexcept nogil:
-    cdef int64_t* stamps
-    cdef double* a
-    cdef int64_t begin
-    cdef int64_t held
-    cdef double dt
-    cdef bint frozen
-    cdef double* sample
-    cdef double span
-    cdef double middle
-    cdef double end
-    cdef double force_change[3]
-    cdef int _i
-    cdef double rate_change[3]
-    cdef double force_b[3]
-    cdef double rate_b[3]
-    stamps = state.stamps
-    a = state.auxiliary
-    begin, held = (<int64_t>(stamps[0])), (<int64_t>(stamps[1]))
-    if (t_ns <= begin):
-        return
-    dt = ((t_ns - begin) * 1e-09)
-    stamps[0] = t_ns
-    frozen = (not source_health_is_trusted(state.memory + (plan.imu_source) * MEMORY_SIZE))
-    if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > plan.imu_gap_ns) or frozen):
-        strapdown_coast(state, dt, &plan.noise, motion_constraints_rests(state, plan))
-        a[35] = (0.5 * 0.5)
-        return
-    sample = imu.values
-    span = (<double>((imu.t_ns - held)))
-    middle = (((<double>(((begin - held) + (t_ns - held)))) / 2) / span)
-    end = ((<double>((t_ns - held))) / span)
-    for _i in range(3):
-        force_change[_i] = (sample[_i] - a[_i])
-    for _i in range(3):
-        rate_change[_i] = ((sample + 3)[_i] - (a + 3)[_i])
-    for _i in range(3):
-        force_b[_i] = (a[_i] + (middle * force_change[_i]))
-    for _i in range(3):
-        rate_b[_i] = ((a + 3)[_i] + (middle * rate_change[_i]))
-    for _i in range(3):
-        (a + 6)[_i] = (a[_i] + (end * force_change[_i]))
-    for _i in range(3):
-        (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
-    a[35] = ((plan.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
-    strapdown_propagate(state, dt, force_b, rate_b, &plan.noise)
-
-cdef void step_predict(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
-    cdef int64_t* stamps
-    cdef double* a
-    cdef int64_t begin
-    cdef int64_t _t1
-    cdef int64_t _t2
-    cdef int64_t until
-    stamps = state.stamps
-    a = state.auxiliary
-    begin = (<int64_t>(stamps[0]))
-    if ((t_ns <= begin) or (stamps[9] != 2)):
-        return
-    _t1 = (<int64_t>((stamps[1] + plan.imu_gap_ns)))
-    _t2 = (_t1 if _t1 < t_ns else t_ns)
-    until = (_t2 if _t2 > begin else begin)
-    if (not source_health_is_trusted(state.memory + (plan.imu_source) * MEMORY_SIZE)):
-        until = begin
-    if (until > begin):
-        strapdown_propagate(state, ((until - begin) * 1e-09), a, a + 3, &plan.noise)
-    if (t_ns > until):
-        strapdown_coast(state, ((t_ns - until) * 1e-09), &plan.noise, motion_constraints_rests(state, plan))
-    stamps[0] = t_ns
-
-cdef void step__choose(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil:
-    cdef int64_t* stamps
-    cdef int64_t source
-    cdef int64_t t_ns
-    cdef int64_t begin
-    cdef int64_t model
-    cdef double* values
-    cdef int64_t i
-    cdef State hypothesis
-    cdef double* memory
-    cdef int64_t* own
-    cdef double* parameter
-    cdef double factor
-    stamps = state.stamps
-    source = (<int64_t>row.source)
-    t_ns = (<int64_t>row.t_ns)
-    begin = (<int64_t>(stamps[0]))
-    model = (<int64_t>(plan.models[source]))
-    values = row.values
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            stamps[0] = begin
-            hypothesis = hypothesis_of(state, i)
-            step_advance(&hypothesis, t_ns, imu, plan)
-    stamps[0] = (t_ns if t_ns > begin else begin)
-    if (model == -1):
-        step_keep_sample(state, row, plan)
-        heading_bank_constrain(state, plan)
-        return
-    memory = state.memory + (source) * MEMORY_SIZE
-    own = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
-    parameter = plan.parameters + (source) * PARAMETERS
-    source_health_arrive(memory, own, values, t_ns)
-    measurement_remember(memory, model, values)
-    if ((model == 2) and motion_constraints_carried(state, memory[0], plan)):
-        row.outcome = 1
-        return
-    factor = measurement_factor_of(own, model, values, parameter, t_ns)
-    for i in range(13):
-        if (state.bank[(i) * BLOCK + 0] > 0):
-            heading_bank_measure(state, i, model, values, parameter, factor, plan)
-    own[1] = t_ns
-    if (model == 0):
-        stamps[4] = t_ns
-    heading_bank_settle(state, plan)
-
-cdef void step_keep_sample(State* state, Row* row, Plan* plan) noexcept nogil:
-    cdef int64_t* stamps
-    cdef double* a
-    cdef int64_t t_ns
-    cdef double dt
-    cdef double* memory
-    cdef int64_t* own
-    cdef bint same
-    stamps = state.stamps
-    a = state.auxiliary
-    t_ns = (<int64_t>row.t_ns)
-    dt = (((t_ns - stamps[1]) * 1e-09) if (stamps[1] != (<int64_t>-4611686018427387904)) else 0.0)
-    memory = state.memory + (plan.imu_source) * MEMORY_SIZE
-    own = state.source_stamps + (plan.imu_source) * SOURCE_STAMPS_SIZE
-    same = source_health_arrive(memory, own, row.values, t_ns)
-    source_health_judge_repetition(memory, own, same, t_ns)
-    step_hold(state, row.values, t_ns)
-    a[35] = ((plan.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
-    motion_constraints_watch(state, a, a + 3, dt, plan)
-
-cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
-    cdef double* a
-    cdef int64_t i
-    cdef double _t1
-    cdef double _t2
-    a = state.auxiliary
-    state.stamps[1] = t_ns
-    for i in range(3):
-        _t1 = values[i]
-        a[(0 + i)] = _t1
-        a[(6 + i)] = _t1
-        _t2 = values[(3 + i)]
-        a[(3 + i)] = _t2
-        a[(9 + i)] = _t2
-
-cdef void step_guard(State* state) noexcept nogil:
-    cdef double total
-    cdef int64_t i
-    cdef int64_t resets
-    cdef int64_t blown
-    total = 0.0
-    for i in range(NOMINAL_SIZE):
-        total += state.nominal[i]
-    for i in range(n):
-        total += state.covariance[(i) * n + i]
-    if isfinite(total):
-        return
-    resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
-    clear_state(state)
-    state.stamps[10], state.stamps[17] = (resets + 1), (blown + 1)
-    state.stamps[18] = 3
-
-cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int64_t source, int64_t sequence) noexcept nogil:
-    cdef int64_t i
-    cdef Row* row
-    i = end
-    while (i > begin):
-        row = (rows + (i - 1))
-        if (row.t_ns < t_ns):
-            break
-        if (row.t_ns == t_ns):
-            if (row.source < source):
-                break
-            if (row.source == source):
-                if (row.sequence == sequence):
-                    return (~((i - 1) - begin))
-                if (row.sequence < sequence):
-                    break
-        i -= 1
-    return (i - begin)
-
-cdef int64_t step_first_changed(Row* rows, int64_t begin, int64_t new, Plan* plan) noexcept nogil:
-    cdef int64_t i
-    i = (begin + new)
-    if (plan.models[(<int64_t>(((rows + i)).source))] != -1):
-        return new
-    while ((i > begin) and (plan.models[(<int64_t>(((rows + (i - 1))).source))] != -1)):
-        i -= 1
-    while ((begin < i < (begin + new)) and (((rows + i)).t_ns == ((rows + (i - 1))).t_ns)):
-        i += 1
-    return (i - begin)
