@@ -1,4 +1,5 @@
-"""The filter's own decisions and mixtures against the closed forms of tests.oracles, which know nothing of the filter."""
+"""A scenario across modules: the filter's decisions (source health, heading bank, clutter) and mixtures against the closed
+forms of tests.oracles, which know nothing of the filter."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from fusiond.config.schema import Wheel
 from fusiond.events import WheelSpeed
 from fusiond.filter import heading_bank as bank
 from fusiond.filter import source_health as health
-from fusiond.filter.measurement_update import detection, inject, update
+from fusiond.filter.measurement_update import CLUTTER_FIELD, detection, difference, inject, update
 from fusiond.filter.observations import wheel_speed
 from fusiond.filter.observations.model import SHARED, Observation
 from fusiond.filter.parameters import plan
@@ -28,7 +29,7 @@ from fusiond.filter.state import (
     T_LAST,
     FilterState,
 )
-from fusiond.maths.portable import exp
+from fusiond.maths.typed import Array
 from tests.helpers.streams import SECOND, T0, config, running_state
 from tests.oracles.adaptive import fused
 from tests.oracles.decision import missed, posterior
@@ -37,18 +38,30 @@ from tests.oracles.mixture import Mixture, clutter_update, collapse
 
 
 def test_health_is_bayes_rule_after_a_prior_that_time_has_blurred() -> None:
-    """D1: ten looks at a source that is off by more and more."""
+    """D1: ten looks at a source on two axes that is off by more and more; likelihoods as in THEORY D1, a bias followed by a
+    scalar Kalman filter an axis and forgotten where a new one explains the innovation better."""
     memory, stamps = np.zeros(MEMORY_SIZE), np.full(SOURCE_STAMPS_SIZE, NEVER)
     health.begin(memory)
-    held = np.array(health.PRIOR)
+    held, bias, spread = np.array(health.PRIOR), np.zeros(2), health.FIRST_BIAS_VARIANCE
+
+    def density(off: Array, variance: float) -> float:
+        return math.exp(-float(off @ off) / (2 * variance)) / variance  # of two axes, but for 2 pi
+
     for number in range(10):
         whitened = np.array([0.4 * number, -0.1])
-        reference = memory.copy()
-        health._renew_bias(reference, whitened)
-        likelihoods = np.array(health.likelihoods(reference, whitened, False))
-        blurred = 1 - exp(-(health.KEEPS if number == 0 else 0.2) / health.KEEPS)
-        held = posterior(held + blurred * (np.array(health.PRIOR) - held), likelihoods)
-        health.judge(memory, stamps, health.Judgement(whitened, False, T0 + number * SECOND // 5))
+        if density(whitened, 1 + health.FIRST_BIAS_VARIANCE) > density(whitened - bias, 1 + spread):
+            bias, spread = np.zeros(2), health.FIRST_BIAS_VARIANCE
+        size = float(np.linalg.norm(bias))
+        called = bias * (health.MIN_BIAS / size) if spread < 1 and 1e-9 < size < health.MIN_BIAS else bias
+        models = density(whitened, 1.0), density(whitened, health.NOISY_VARIANCE), density(whitened - called, 1 + spread)
+        outlier = density(whitened, health.OUTLIER_VARIANCE)
+        likelihoods = [(1 - health.OUTLIERS) * model + health.OUTLIERS * outlier for model in models]
+        likelihoods.append(outlier * health.OTHER_IF_FROZEN)
+        gain = (spread + health.BIAS_WALK) / (spread + health.BIAS_WALK + 1)
+        bias, spread = bias + gain * (whitened - bias), (1 - gain) * (spread + health.BIAS_WALK)
+        blurred = 1 - math.exp(-(health.KEEPS if number == 0 else 0.2) / health.KEEPS)
+        held = posterior(held + blurred * (np.array(health.PRIOR) - held), np.array(likelihoods))
+        health.judge(memory, stamps, whitened, 2, False, T0 + number * SECOND // 5)
         np.testing.assert_allclose(memory[BELIEF], held, rtol=1e-12)
     assert memory[BELIEF].argmax() != 0
 
@@ -84,7 +97,7 @@ def test_a_collapsed_bank_has_the_moments_of_its_mixture() -> None:
     bank.settle(state, settings)
     assert state.stamps[PHASE] == RUNNING
     reference = collapse(Mixture(shares, errors, np.array(spreads)))
-    np.testing.assert_allclose(bank.difference(state, begin), reference.mean, atol=1e-8)
+    np.testing.assert_allclose(difference(state, begin), reference.mean, atol=1e-8)
     np.testing.assert_allclose(state.covariance, reference.covariance, rtol=1e-6, atol=1e-12)
 
 
@@ -98,14 +111,12 @@ def test_a_fix_that_may_be_clutter(metres: float) -> None:
     innovation, variance, share = np.array([metres, 0.3, -0.2]), np.full(3, 2.0), 0.05
     spread = jacobian @ state.covariance @ jacobian.T + np.diag(variance)
     distance = float(innovation @ np.linalg.solve(spread, innovation))
-    odds = detection(distance, 3, share)
-    density = math.exp(-distance / 2) / math.sqrt((2 * math.pi) ** 3 * np.linalg.det(spread))
-    clutter = (1 - share) * density * (1 - odds) / odds / share  # the density that gives the same odds
+    clutter = 1 / (CLUTTER_FIELD**3 * math.sqrt(np.linalg.det(spread)))  # uniform over a field of 100 sigmas an axis
     prior = Gaussian(np.zeros(state.size), state.covariance.copy())
     reference, probability = clutter_update(prior, (innovation, jacobian, np.diag(variance)), 1 - share, clutter)
-    assert probability == pytest.approx(odds, rel=1e-9)
+    assert detection(distance, 3, share) == pytest.approx(probability, rel=1e-9)
     before = state.copy()
-    update(state, Observation(innovation, jacobian, variance), 16.0, clutter=share)
+    update(state, Observation.of(innovation, jacobian, variance), 16.0, clutter=share)
     np.testing.assert_allclose(state.nominal[:6] - before.nominal[:6], reference.mean[:6], atol=1e-9)
     np.testing.assert_allclose(state.covariance, reference.covariance, atol=1e-9)
 
@@ -129,7 +140,7 @@ def test_redundant_wheels_are_weighted_by_their_variances() -> None:
     jacobian = np.zeros((1, state.size))
     jacobian[0, 3] = 1.0
     for value, variance in zip(values, variances, strict=True):
-        update(state, Observation(np.array([value - state.nominal[3]]), jacobian, np.array([variance])), 1e9)
+        update(state, Observation.of(np.array([value - state.nominal[3]]), jacobian, np.array([variance])), 1e9)
     mean, variance = fused(values, variances)
     assert state.nominal[3] == pytest.approx(mean, rel=1e-6)
     assert state.covariance[3, 3] == pytest.approx(variance, rel=1e-6)

@@ -8,11 +8,36 @@ import numpy as np
 import pytest
 
 from fusiond.events import GnssPosition, Measurement
+from fusiond.filter.measurement_update import (
+    _solve,
+    cholesky,
+    correlation_factor,
+    difference,
+    inject,
+    project,
+    turn_along,
+    update,
+    whiten,
+)
 from fusiond.filter.observations.model import Observation
 from fusiond.filter.parameters import plan
-from fusiond.filter.state import ATTITUDE, NEVER, POSITION, POSITION_E, SCALE, WHEEL_SCALE, FilterState
+from fusiond.filter.state import (
+    ATTITUDE,
+    ERROR_SIZE,
+    NEVER,
+    POSITION,
+    POSITION_E,
+    QUATERNION_EB,
+    SCALE,
+    VELOCITY,
+    VELOCITY_E,
+    WHEEL_SCALE,
+    WIDE_SIZE,
+    FilterState,
+)
 from fusiond.filter.strapdown import coast
-from fusiond.maths.statistics import chi_square, cholesky, correlation_factor, solve, update
+from fusiond.maths.rotation import matrix, quaternion_exp, skew
+from fusiond.maths.statistics import chi_square
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import geodetic
 from tests.helpers.streams import T0, apply, config, running_state
@@ -25,7 +50,7 @@ def scalar(value: float, variance: float, state: FilterState) -> Observation:
     """A direct measurement of the wheel scale, which stands for a scalar of its own."""
     jacobian = np.zeros((1, state.size))
     jacobian[0, PLACE] = 1.0
-    return Observation(value - state.nominal[WHEEL_SCALE], jacobian, np.array([variance]))
+    return Observation.of(value - state.nominal[WHEEL_SCALE], jacobian, np.array([variance]))
 
 
 def scalar_state(mean: float, variance: float) -> FilterState:
@@ -56,7 +81,7 @@ def test_product_of_two_scalar_gaussians() -> None:
 def place_seen(state: FilterState, value: Array, variance: Array) -> Observation:
     jacobian = np.zeros((3, state.size))
     jacobian[:, POSITION] = np.eye(3)
-    return Observation(value - state.nominal[POSITION_E], jacobian, variance)
+    return Observation.of(value - state.nominal[POSITION_E], jacobian, variance)
 
 
 def test_product_of_two_vector_gaussians() -> None:
@@ -129,31 +154,6 @@ def test_joseph_form_keeps_an_ill_conditioned_covariance_positive(compiled: bool
         assert np.linalg.eigvalsh(state.covariance).min() > -np.finfo(float).eps * 1e6
 
 
-@pytest.mark.parametrize(
-    ("probability", "freedom", "table"),
-    [
-        (0.95, 1, 3.841459),
-        (0.95, 2, 5.991465),
-        (0.95, 3, 7.814728),
-        (0.999, 1, 10.827566),
-        (0.999, 2, 13.815511),
-        (0.999, 3, 16.266236),
-        (0.5, 1, 0.454936),
-        (0.99, 10, 23.209251),
-        (0.999999, 3, 30.664848),
-    ],
-)
-def test_chi_square_against_tables(probability: float, freedom: int, table: float) -> None:
-    assert chi_square(probability, freedom) == pytest.approx(table, rel=1e-6)
-
-
-def test_chi_square_at_the_ends() -> None:
-    assert chi_square(1e-12, 2) == pytest.approx(2e-12, rel=1e-3)
-    assert 70 < chi_square(1 - 1e-16, 2) < 1000  # as near to 1 as a number gets
-    for probability in (0.01, 0.5, 0.9999):  # two degrees have a closed form
-        assert chi_square(probability, 2) == pytest.approx(-2 * math.log1p(-probability), rel=1e-12)
-
-
 def test_gate_is_closed_above_one_and_open_up_to_it() -> None:
     gate = chi_square(0.999, 1)
     edge = math.sqrt(gate * (1.0 + 4.0))
@@ -218,10 +218,71 @@ def test_correlation_factor() -> None:
 def test_cholesky_and_solve() -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(3, 3))
-    matrix, right = root @ root.T + np.eye(3), rng.normal(size=(3, 5))
-    lower = cholesky(matrix)
-    assert lower is not None
-    np.testing.assert_allclose(lower @ lower.T, matrix, atol=1e-12)
-    np.testing.assert_allclose(matrix @ solve(lower, right), right, atol=1e-12)
+    spread, right = root @ root.T + np.eye(3), rng.normal(size=(3, 5))
+    variance, lower, gain = np.array([0.5, 0.0, 2.0]), np.zeros((3, 3)), np.empty((3, 5))
+    for factor in (1.0, 7.0):
+        matrix = spread + factor * np.diag(variance)
+        assert cholesky(spread, variance, factor, 3, lower)
+        np.testing.assert_allclose(lower @ lower.T, matrix, atol=1e-12)
+        assert not np.triu(lower, 1).any()
+        _solve(lower, right, 3, gain)
+        np.testing.assert_allclose(matrix @ gain, right, atol=1e-12)
     for bad in (-np.eye(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.diag([1.0, math.nan]), np.diag([math.inf, 1.0])):
-        assert cholesky(bad) is None
+        assert not cholesky(bad, np.zeros(2), 1.0, 2, lower)
+    for wrong in (-1e-300, math.nan, math.inf):
+        assert not cholesky(np.eye(2), np.array([1.0, wrong]), 1.0, 2, lower)
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_projection_and_whitening_against_matrices(m: int) -> None:
+    """H P, H P H', and L^-1 d of H P H' + R = L L'."""
+    rng = np.random.default_rng(5)
+    state = running_state(rng)
+    jacobian, innovation, variance = rng.normal(size=(m, state.size)), rng.normal(size=m), rng.uniform(0.1, 2.0, m)
+    jacobian[:, rng.permutation(state.size)[:6]] = 0.0  # most models see a part of the state
+    across, spread, whitened = np.empty((3, state.size)), np.empty((3, 3)), np.empty(3)
+    project(state, Observation.of(innovation, jacobian, variance), across, spread)
+    np.testing.assert_allclose(across[:m], jacobian @ state.covariance, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(spread[:m, :m], jacobian @ state.covariance @ jacobian.T, rtol=1e-12)
+    assert whiten(spread, innovation, variance, m, whitened)
+    lower = np.linalg.cholesky(jacobian @ state.covariance @ jacobian.T + np.diag(variance))
+    np.testing.assert_allclose(whitened[:m], np.linalg.solve(lower, innovation), rtol=1e-11)
+
+
+def test_a_correction_turns_along_with_the_attitude() -> None:
+    """P = M P M', with -[correction]x where M's rows of position and velocity meet its columns of attitude."""
+    rng = np.random.default_rng(6)
+    state, error = running_state(rng), rng.normal(size=18)
+    turn = np.eye(18)
+    for block in (POSITION, VELOCITY):
+        turn[block, ATTITUDE] = -skew(error[block])
+    expected = turn @ state.covariance @ turn.T
+    turn_along(state.covariance, error)
+    np.testing.assert_allclose(state.covariance, expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_array_equal(state.covariance, state.covariance.T)
+
+
+@pytest.mark.parametrize("size", [ERROR_SIZE, WIDE_SIZE])
+def test_injection_adds_every_block_to_its_own(size: int) -> None:
+    state = running_state(np.random.default_rng(7), size=size)
+    before, error = state.copy(), np.random.default_rng(8).normal(0.0, 1e-2, size)
+    inject(state, error)
+    change = state.nominal - before.nominal
+    np.testing.assert_allclose(change[POSITION_E], error[POSITION], atol=2e-9)  # of 6,400 km
+    np.testing.assert_allclose(change[VELOCITY_E], error[VELOCITY], rtol=1e-9)
+    np.testing.assert_allclose(change[QUATERNION_EB.stop : size + 1], error[ATTITUDE.stop :], rtol=1e-9)
+    turn = matrix(state.nominal[QUATERNION_EB]) @ matrix(before.nominal[QUATERNION_EB]).T
+    np.testing.assert_allclose(turn, matrix(quaternion_exp(error[ATTITUDE])), atol=1e-14)
+    np.testing.assert_array_equal(state.covariance, before.covariance)
+
+
+@pytest.mark.parametrize("size", [ERROR_SIZE, WIDE_SIZE])
+def test_difference_is_what_inject_adds(size: int) -> None:
+    rng = np.random.default_rng(1)
+    state = running_state(rng, size=size)
+    moved, error = state.copy(), rng.normal(0.0, 1e-3, state.size)
+    inject(moved, error)
+    np.testing.assert_allclose(difference(moved, state), error, atol=1e-8)
+    assert abs(difference(moved, state)[ATTITUDE]).max() > 0
+    moved.nominal[QUATERNION_EB] *= -1  # the same attitude
+    np.testing.assert_allclose(difference(moved, state), error, atol=1e-8)

@@ -51,12 +51,12 @@ def test_bayes_by_hand() -> None:
     expected, bias, spread, last = np.array(health.PRIOR), 0.0, health.FIRST_BIAS_VARIANCE, None
     for k, (e, same) in enumerate([(0.5, False), (4.0, False), (4.2, True)]):
         t_ns = T0 + k * SECOND // 10
-        health.judge(memory, stamps, health.Judgement(np.array([e]), same, t_ns))
+        health.judge(memory, stamps, np.array([e]), 1, same, t_ns)
         blurred = 1 - math.exp(-(health.KEEPS if last is None else 0.1) / health.KEEPS)
         last = t_ns
         if gaussian(e * e, 1 + health.FIRST_BIAS_VARIANCE, 1) > gaussian((e - bias) ** 2, 1 + spread, 1):
             bias, spread = 0.0, health.FIRST_BIAS_VARIANCE
-        stretch = health.LEAST_BIAS / abs(bias) if spread < 1 and 0 < abs(bias) < health.LEAST_BIAS else 1.0
+        stretch = health.MIN_BIAS / abs(bias) if spread < 1 and 0 < abs(bias) < health.MIN_BIAS else 1.0
         outlier = gaussian(e * e, health.OUTLIER_VARIANCE, 1)
         alike = [health.SAME_IF_NOMINAL, health.SAME_IF_FAULTY, health.SAME_IF_FAULTY] if same else [1.0] * 3
         off = (e - bias * stretch) ** 2
@@ -90,10 +90,10 @@ def test_absence_by_hand() -> None:
 def test_noise_is_learnt_from_innovations(ratio: float) -> None:
     """C3: from four times too small and four times too large."""
     rng, (memory, _) = np.random.default_rng(3), blank()
-    given, predicted = np.full(2, 0.5), np.full(2, 0.2)
+    given, predicted = np.full(2, 0.5), np.diag([0.2, 0.2])
     for _ in range(20_000):
         innovation = rng.normal(0.0, math.sqrt(ratio * 0.5 + 0.2), 2)
-        health.learn(memory, (innovation, given), predicted, 0.1)
+        health.learn(memory, innovation, given, predicted, 2, 0.1)
     assert 1 + memory[NOISE_EXCESS] == pytest.approx(ratio, rel=0.25)
     assert health.noise_factor(memory, 0.5, 2.0) == (0.5 if ratio < 1 else 2.0)
     assert memory[MEAN_NIS] == pytest.approx((ratio * 0.5 + 0.2) / 0.7, rel=0.5)

@@ -11,10 +11,11 @@ from fusiond.config.schema import DualAntenna
 from fusiond.events import GnssYaw
 from fusiond.filter.measurement_update import inject
 from fusiond.filter.observations import gnss_yaw
-from fusiond.filter.observations.model import CORRELATION, PARAMETERS, VALUES, Observation, Unusable
+from fusiond.filter.observations.model import PARAMETERS, VALUES, Unusable
 from fusiond.filter.state import ATTITUDE, POSITION_E, QUATERNION_EB, WIDE_SIZE, FilterState
 from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.maths.wgs84 import ecef, mat_ne
+from tests.helpers.observations import Observed, observed
 from tests.helpers.streams import MUNICH, running_state
 
 STEP = 1e-5  # rad
@@ -33,10 +34,10 @@ def turned(roll: float, pitch: float, yaw: float) -> FilterState:
     return state
 
 
-def seen(state: FilterState, yaw_deg: float, section: DualAntenna) -> Observation | None:
+def seen(state: FilterState, yaw_deg: float, section: DualAntenna) -> Observed | None:
     row = np.zeros(VALUES)
     row[:3] = gnss_yaw.values(GnssYaw(math.radians(yaw_deg)), section)
-    return gnss_yaw.observe(state, row, gnss_yaw.parameters(section))
+    return observed(gnss_yaw.observe, state, row, gnss_yaw.parameters(section))
 
 
 def innovation_deg(state: FilterState, yaw_deg: float, section: DualAntenna) -> float:
@@ -95,9 +96,8 @@ def test_a_baseline_that_is_nearly_vertical_has_no_yaw(pitch: float, used: bool)
 
 
 def test_values_and_parameters() -> None:
-    section = antennas(sigma_deg=0.5, correlation_s=4.0)
-    row = gnss_yaw.parameters(section)
-    assert (row.shape, row[CORRELATION]) == ((PARAMETERS,), 4.0)
+    section = antennas(sigma_deg=0.5)
+    assert gnss_yaw.parameters(section).shape == (PARAMETERS,)
     half = math.radians(0.5)
     for sigma, used in ((None, half), (0.0, half), (half / 2, half), (3 * half, 3 * half)):
         sine, cosine, variance = gnss_yaw.values(GnssYaw(2.0, sigma), section)

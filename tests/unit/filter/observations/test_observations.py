@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from fusiond.config.schema import Barometer, Gnss, Motion, Wheel
-from fusiond.events import GnssPosition, GnssVelocity, Pressure, WheelSpeed
+from fusiond.config.schema import Barometer, DualAntenna, Gnss, Motion, Wheel
+from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, Pressure, WheelSpeed
 from fusiond.filter.measurement_update import inject
 from fusiond.filter.observations import (
     CONSTRAINTS,
@@ -19,12 +19,13 @@ from fusiond.filter.observations import (
     barometric_height,
     gnss_position,
     gnss_velocity,
+    gnss_yaw,
     non_holonomic,
     wheel_speed,
     zero_rotation,
     zero_velocity,
 )
-from fusiond.filter.observations.model import LEVER_ARM_B, PARAMETERS, VALUES, mat_eb, mat_vb, rate_b
+from fusiond.filter.observations.model import LEVER_ARM_B, PARAMETERS, VALUES, Observation, mat_eb, rate_b
 from fusiond.filter.observations.wheel_speed import direction
 from fusiond.filter.state import (
     GYRO_BIAS_B,
@@ -42,6 +43,7 @@ from fusiond.filter.state import (
 from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import ecef, mat_ne
+from tests.helpers.observations import Observed, observed
 from tests.helpers.streams import EARTH_RATE_E, MUNICH, running_state
 
 GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
@@ -49,7 +51,14 @@ WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
 STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])
 BAROMETER = Barometer(link="l")
+ANTENNAS = DualAntenna(link="l", offset_deg=50.0)
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
+
+
+Observe = Callable[[FilterState, Array, Array, Observation], bool]
+OBSERVE: dict[str, Observe] = {model.name: model.observe for model in MODELS} | {
+    constraint.__name__.rpartition(".")[2]: constraint.observe for constraint in CONSTRAINTS
+}
 
 
 class Case(NamedTuple):
@@ -86,6 +95,7 @@ CASES = {
         barometric_height.parameters(BAROMETER),
         10.0,
     ),
+    "yaw": Case("gnss_yaw", gnss_yaw.values(GnssYaw(1.0), ANTENNAS), gnss_yaw.parameters(ANTENNAS), 10.0),
     "wheel signed": wheel_case(10.0, 10.0, unsigned=False),
     "wheel signed in reverse": wheel_case(-3.0, -3.1, unsigned=False),
     "wheel signed at rest": wheel_case(0.0, 0.0, unsigned=False),
@@ -112,16 +122,21 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     return state
 
 
-def test_every_model_has_a_case() -> None:
-    assert {case.model for case in CASES.values()} == {model.name for model in MODELS}
-    assert all(model.table is None for model in CONSTRAINTS)
-
-
-def predicted(observe: Callable[..., object], state: FilterState, row: Array, parameters: Array) -> Array:
-    """h(x): what a reading of zero would miss by."""
-    seen = observe(state, row, parameters)
+def found(observe: Observe, state: FilterState, row: Array, parameters: Array) -> Observed:
+    """What a model observes where there is something to observe."""
+    seen = observed(observe, state, row, parameters)
     assert seen is not None
-    return -seen.innovation  # type: ignore[attr-defined,no-any-return]
+    return seen
+
+
+def test_every_model_has_a_case() -> None:
+    assert {case.model for case in CASES.values()} == set(OBSERVE)
+    assert len(OBSERVE) == len(MODELS) + len(CONSTRAINTS)
+
+
+def predicted(observe: Observe, state: FilterState, row: Array, parameters: Array) -> Array:
+    """h(x): what a reading of zero would miss by."""
+    return -found(observe, state, row, parameters).innovation
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -129,11 +144,10 @@ def predicted(observe: Callable[..., object], state: FilterState, row: Array, pa
 def test_jacobian_against_finite_differences(case: Case, seed: int) -> None:
     """d h / d error = - d innovation / d error, for a direct measurement at a fixed reading."""
     state = moving_state(np.random.default_rng(seed), case.speed)
-    observe = next(model.observe for model in MODELS if model.name == case.model)
+    observe = OBSERVE[case.model]
     row = np.zeros(VALUES)
     row[: len(case.values)] = case.values
-    seen = observe(state, row, case.parameters)
-    assert seen is not None
+    seen = found(observe, state, row, case.parameters)
     m = len(seen.innovation)
     assert (seen.jacobian.shape, seen.variance.shape) == ((m, state.size), (m,))
     assert (seen.variance > 0).all()
@@ -166,7 +180,7 @@ def test_position_of_the_antenna() -> None:
     state = level_state(math.pi / 2)  # facing east: the antenna is 0.4 m west, 0.3 m south, 1.2 m above
     place = ecef(*MUNICH) + mat_ne(ecef(*MUNICH)).T @ np.array([-0.3, -0.4, -1.2])
     row = np.array([*place, 1.0, 4.0, 0.0, 0.0, 0.0])
-    seen = gnss_position.observe(state, row, gnss_position.parameters(GNSS))
+    seen = found(gnss_position.observe, state, row, gnss_position.parameters(GNSS))
     np.testing.assert_allclose(seen.innovation, 0.0, atol=3e-9)
     np.testing.assert_array_equal(seen.variance, [1.0, 1.0, 4.0])
 
@@ -176,7 +190,7 @@ def test_velocity_of_the_antenna() -> None:
     state.nominal[GYRO_BIAS_B] = (0.0, 0.0, 0.1)
     state.auxiliary[RATE_B] = (0.0, 0.0, 0.6)  # turns right by 0.5 rad/s
     row = padded(gnss_velocity.values(GnssVelocity(-0.15, -0.2, 0.0), GNSS))
-    seen = gnss_velocity.observe(state, row, gnss_velocity.parameters(GNSS))
+    seen = found(gnss_velocity.observe, state, row, gnss_velocity.parameters(GNSS))
     np.testing.assert_allclose(seen.innovation, 0.0, atol=1e-9)
 
 
@@ -195,11 +209,11 @@ def test_wheel_reads_its_contact_point_with_the_scale() -> None:
     state.nominal[WHEEL_SCALE] = 0.02
     state.auxiliary[RATE_B] = (0.0, 0.0, 0.5)  # turning right: the left wheel is the outer one
     row = padded((1.02 * (10.0 + 0.5 * 0.8), 0.01))
-    seen = wheel_speed.observe(state, row, wheel_speed.parameters(WHEEL))
+    seen = found(wheel_speed.observe, state, row, wheel_speed.parameters(WHEEL))
     assert seen.innovation[0] == pytest.approx(0.0, abs=1e-12)
     steered = msgspec.structs.replace(WHEEL, steered=True)
     along = math.hypot(10.4, 0.5 * 1.3)
-    seen = wheel_speed.observe(state, padded((1.02 * along, 0.01)), wheel_speed.parameters(steered))
+    seen = found(wheel_speed.observe, state, padded((1.02 * along, 0.01)), wheel_speed.parameters(steered))
     assert seen.innovation[0] == pytest.approx(0.0, abs=1e-12)
 
 
@@ -208,7 +222,7 @@ def test_wheel_values() -> None:
     speed, variance, alike = wheel_speed.values(WheelSpeed(5.0), wheel)
     assert (speed, variance, alike) == (5.0, pytest.approx(0.01 + 0.03), 0.2)
     speed, variance, alike = wheel_speed.values(WheelSpeed(0.0), wheel)
-    assert (speed, variance, alike) == (0.0, pytest.approx(0.04 + 0.03), wheel_speed.SLOW_ALIKE)
+    assert (speed, variance, alike) == (0.0, pytest.approx(0.04 + 0.03), wheel_speed.SLOW_CORRELATION)
 
 
 def test_sign_of_an_unsigned_wheel() -> None:
@@ -218,7 +232,7 @@ def test_sign_of_an_unsigned_wheel() -> None:
     for speed, parameters, expected in ((-5.0, unsigned, 0.0), (-5.0, signed, 10.0), (5.0, unsigned, 0.0)):
         state = level_state()
         state.nominal[VELOCITY_E] = mat_eb(state) @ [speed, 0.0, 0.0]
-        seen = wheel_speed.observe(state, row, parameters)
+        seen = found(wheel_speed.observe, state, row, parameters)
         assert seen.innovation[0] == pytest.approx(expected, abs=1e-12)
         assert seen.variance[0] == 0.01
 
@@ -231,25 +245,24 @@ def test_slow_unsigned_wheel_is_a_mixture_of_two_directions() -> None:
     assert (direction(0.0), direction(1e9), direction(-1e9)) == (0.0, 1.0, -1.0)
     state = level_state()
     state.covariance[3:6, 3:6] = np.eye(3)
-    still = wheel_speed.observe(state, padded((z, 0.01, 0.0)), wheel_speed.parameters(WHEEL))
+    still = found(wheel_speed.observe, state, padded((z, 0.01, 0.0)), wheel_speed.parameters(WHEEL))
     assert still.innovation[0] == pytest.approx(0.0, abs=1e-12)  # no direction, so no push either way
-    assert still.variance[0] == pytest.approx(0.01 + wheel_speed.DIRECTION_ALIKE * z * z)
+    assert still.variance[0] == pytest.approx(0.01 + wheel_speed.SAME_DIRECTION * z * z)
 
 
 def test_non_holonomic_rests_when_slow() -> None:
     state, parameters = level_state(), non_holonomic.parameters(Motion(minimum_speed_mps=2.0))
     for speed, rests in ((1.99, True), (-1.99, True), (2.01, False), (-2.01, False)):
         state.nominal[VELOCITY_E] = mat_eb(state) @ [speed, 0.0, 0.0]
-        assert (non_holonomic.observe(state, parameters, parameters) is None) is rests
+        assert (observed(non_holonomic.observe, state, parameters, parameters) is None) is rests
 
 
 def test_non_holonomic_takes_the_mount_out() -> None:
     state, parameters = level_state(), non_holonomic.parameters(Motion())
     pitch, yaw = 0.03, -0.02
     state.nominal[MOUNT] = pitch, yaw
-    state.nominal[VELOCITY_E] = mat_eb(state) @ (mat_vb(pitch, yaw)[0].T @ [12.0, 0.0, 0.0])
-    seen = non_holonomic.observe(state, parameters, parameters)
-    assert seen is not None
+    state.nominal[VELOCITY_E] = mat_eb(state) @ (matrix_from_euler(0.0, pitch, yaw).T @ [12.0, 0.0, 0.0])
+    seen = found(non_holonomic.observe, state, parameters, parameters)
     np.testing.assert_allclose(seen.innovation, 0.0, atol=1e-12)
 
 
@@ -257,7 +270,7 @@ def test_zero_rotation_allows_for_the_earth() -> None:
     state, parameters = level_state(), zero_rotation.parameters(Motion())
     state.nominal[GYRO_BIAS_B] = (0.01, -0.02, 0.03)
     state.auxiliary[RATE_B] = state.nominal[GYRO_BIAS_B] + mat_eb(state).T @ EARTH_RATE_E
-    np.testing.assert_allclose(zero_rotation.observe(state, parameters, parameters).innovation, 0.0, atol=1e-16)
+    np.testing.assert_allclose(found(zero_rotation.observe, state, parameters, parameters).innovation, 0.0, atol=1e-16)
     np.testing.assert_allclose(rate_b(state), mat_eb(state).T @ EARTH_RATE_E, atol=1e-16)
 
 
