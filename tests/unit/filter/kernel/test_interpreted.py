@@ -62,7 +62,7 @@ from fusiond.filter.state import (
 )
 from fusiond.filter.step import LOST_HEADING, yaw_variance
 from fusiond.filter.stored_state import StoredState
-from fusiond.maths.rotation import matrix
+from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.paths import ROOT
@@ -186,6 +186,9 @@ def near(state: FilterState, kind: str, rng: np.random.Generator) -> Payload:
         return GnssVelocity(*(rng.normal(0.0, 10.0, 2)).tolist(), None, 8.0)
     if kind == "wheel slow":
         return WheelSpeed(abs(float(rng.normal(0.0, 0.5))))
+    if "yaw" in kind:
+        forward_n = mat_ne(x[POSITION_E]) @ mat_eb(state)[:, 0]
+        return GnssYaw(math.atan2(forward_n[1], forward_n[0]) + float(rng.normal(0.0, 0.01)), 0.01)
     return WheelSpeed(abs(speed) if kind == "wheel unsigned" else speed)
 
 
@@ -197,6 +200,8 @@ KINDS = {
     "wheel unsigned": "front_left",
     "wheel slow": "front_left",
     "wheel steered": "front_left",
+    "yaw": "yaw0",
+    "yaw, nearly vertical": "yaw0",
 }
 
 
@@ -214,13 +219,17 @@ def test_every_measurement(kind: str, correlation_s: float, wide: bool) -> None:
         }
         | (LEARNT if wide else {}),
         wheel=wheel | {"correlation_s": correlation_s},
+        dual_antenna={"yaw0": {"link": "link", "correlation_s": correlation_s}},
         filter={"gate_probability": 0.9, "wheel_scale_by": "wheel" if wide else "vehicle"},
     )
     seen: set[int] = set()
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        state = running_state(rng, size=WIDE_SIZE if wide else ERROR_SIZE)
+        state = running_state(rng, sources=8, size=WIDE_SIZE if wide else ERROR_SIZE)
         state.stamps[T_IMU] = T0
+        if "vertical" in kind:
+            mat_nb = matrix_from_euler(0.1, 1.5, float(rng.uniform(-3.0, 3.0)))
+            state.nominal[QUATERNION_EB] = quaternion(mat_ne(state.nominal[POSITION_E]).T @ mat_nb)
         if kind == "wheel slow":
             state.nominal[VELOCITY_E] = rng.normal(0.0, 0.4, 3)
         events = [
@@ -228,8 +237,9 @@ def test_every_measurement(kind: str, correlation_s: float, wide: bool) -> None:
             for i, t_ms in enumerate((1, 2, 6, 10, 14))
         ]
         fusion, _ = both(settings, state, [*events, sample(T0 + 10 * MS, rng), sample(T0 + 20 * MS, rng)])
-        seen |= set(fusion.history.rows["outcome"].tolist())
-    assert Outcome.FUSED in seen
+        rows = fusion.history.rows
+        seen |= set(rows["outcome"][rows["source"] == fusion.plan.sources.index(KINDS[kind])].tolist())
+    assert seen == {Outcome.REJECTED} if "vertical" in kind else Outcome.FUSED in seen
 
 
 def test_rejected_leaves_the_state_and_fused_at_the_edge_of_the_gate() -> None:
@@ -419,10 +429,14 @@ def test_all_that_can_be_learnt() -> None:
     """Lever arm, delays, a scale for each wheel, the barometer's offset; fixes weighed as a mixture; steered wheels with a
     sign; velocities of two axes and of three; a dual-antenna receiver; readings whose errors are correlated."""
 
-    def change(event: Measurement, t: float) -> Payload:
+    def change(event: Measurement, t: float) -> Payload | None:
         payload = event.payload
+        if isinstance(payload, GnssPosition | GnssVelocity) and t < 2.0:
+            return None
         if isinstance(payload, WheelSpeed):
             return WheelSpeed(-payload.speed)
+        if isinstance(payload, GnssPosition) and t > 11.0:
+            return msgspec.structs.replace(payload, latitude=payload.latitude + 1e-3)
         if isinstance(payload, GnssVelocity) and event.sequence % 3 == 0:
             return GnssVelocity(payload.north, payload.east, None, payload.sigma)
         if isinstance(payload, GnssPosition) and event.sequence % 10 == 7:
@@ -483,15 +497,20 @@ def test_a_frozen_imu() -> None:
     assert fusion.beliefs(T0 + 12 * SECOND)["imu0"].status == "nominal"
 
 
-@pytest.mark.parametrize("place", ["nominal", "covariance"])
-def test_a_state_that_is_not_finite(place: str) -> None:
-    def poison(head: FilterState, number: int) -> None:
-        if number == 100:
-            getattr(head, place).flat[4] = math.nan
-
+@pytest.mark.parametrize("before", ["imu0", "gps0.position"])
+@pytest.mark.parametrize(("part", "place"), [("nominal", 4), ("nominal", 11), ("covariance", 0)])
+def test_a_state_that_is_not_finite(part: str, place: int, before: str) -> None:
+    """Velocity, gyro bias, a variance: spoilt before one event of a source, after the filter has run for long."""
     truth = drive(8.0, lambda t: 10.0 + 0 * t, lambda t: 0.7 + 0 * t, rate=25.0)
+    events = sensed(truth, wheels=())
+    when = next(i for i, event in enumerate(events) if event.source == before and event.t_ns > T0 + 3 * SECOND)
+
+    def poison(head: FilterState, number: int) -> None:
+        if number == when:
+            getattr(head, part).flat[place] = math.nan
+
     with np.errstate(invalid="ignore"):
-        fusion = twins(config((), filter=HEADED), sensed(truth, wheels=()), poison=poison)
+        fusion = twins(config((), filter=HEADED), events, poison=poison)
     assert reset_by(fusion)[:2] == (1, ResetReason.NOT_FINITE)
     assert fusion.history.head.stamps[BLOWN] == 1
 
