@@ -1,4 +1,4 @@
-"""What the tests share: the kernel under test, compiled and in NumPy."""
+"""What the tests share: the kernel under test, compiled and interpreted."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fusiond.filter.kernel.interpreted import compiled_available
 needs_compiled = pytest.mark.skipif(not compiled_available(), reason="the compiled kernel was not built")
 
 
-@pytest.fixture(params=[pytest.param(True, id="compiled", marks=needs_compiled), pytest.param(False, id="numpy")])
+@pytest.fixture(params=[pytest.param(True, id="compiled", marks=needs_compiled), pytest.param(False, id="interpreted")])
 def compiled(request: pytest.FixtureRequest) -> bool:
     """Which kernel to ask for."""
     return bool(request.param)
