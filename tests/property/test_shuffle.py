@@ -142,7 +142,7 @@ def test_shuffled_arrivals(case: Case) -> None:
 
 @given(CASES)
 @settings(QUIET, max_examples=2)
-def test_shuffled_arrivals_on_the_twin(case: Case) -> None:
+def test_shuffled_arrivals_in_the_interpreted_kernel(case: Case) -> None:
     check(case, compiled=False)
 
 

@@ -67,7 +67,7 @@ def test_late_events_give_the_result_of_the_right_order(compiled: bool, late: li
     assert fusion.totals() == {name: len(EVENTS) if name == "FUSED" else 0 for name in fusion.totals()}
 
 
-def test_late_events_on_the_twin() -> None:
+def test_late_events_in_the_interpreted_kernel() -> None:
     late = delayed(sources("gps0.position", "imu0", events=until(2.0)), 100 * MS, until(2.0))
     same_bits(fuse(settings(), late, False), fuse(settings(), until(2.0), False))
 

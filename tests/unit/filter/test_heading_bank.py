@@ -1,4 +1,4 @@
-"""The bank of heading hypotheses: it finds the heading from every start, honestly, and twin and kernel agree on it."""
+"""The bank of heading hypotheses: it finds the heading from every start, honestly, and both kernels agree on it."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_at_rest_it_waits_and_then_runs(compiled: bool) -> None:
 
 
 @needs_compiled
-def test_twin_and_kernel_agree_while_choosing() -> None:
+def test_both_kernels_agree_while_choosing() -> None:
     truth = departing(4.0, seconds=3.5)
     for until in (2.5, 3.5):
         events = [event for event in measurements(truth) if event.t_ns < T0 + until * SECOND]

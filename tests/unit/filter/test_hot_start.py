@@ -291,7 +291,7 @@ def test_order_of_arrival_does_not_matter() -> None:
 
 
 @needs_compiled
-def test_twin_and_kernel_agree() -> None:
+def test_both_kernels_agree() -> None:
     _, events = later(seconds=1.5)
     one, other = (hot(events, stored(), compiled).history.head for compiled in (True, False))
     np.testing.assert_array_equal(bits(one.numbers), bits(other.numbers))

@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 
 from fusiond.maths.rotation import (
+    cross,
     euler,
     matrix,
     matrix_from_euler,
+    matrix_product,
     normalised,
     product,
     quaternion,
     quaternion_exp,
     quaternion_multiply,
     skew,
+    times,
+    transposed_times,
 )
 from fusiond.maths.typed import Array
 
@@ -64,6 +68,39 @@ def test_quaternion_of_matrix() -> None:
         assert q[0] >= 0
         assert np.linalg.norm(q) == pytest.approx(1.0)
         np.testing.assert_allclose(matrix(q), matrix(quaternion_exp(vector)), atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", np.eye(3))
+@pytest.mark.parametrize("angle", [-3.0, -2.0, -0.3, 1e-9, 0.3, 2.0, 3.0, math.pi])
+def test_quaternion_is_half_the_angle_about_the_axis(axis: Array, angle: float) -> None:
+    """Rodrigues' formula makes the matrix; each axis and a large angle take the largest part of the quaternion elsewhere."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    a, b, c = axis
+    across = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
+    turned = np.eye(3) + sine * across + (1 - cosine) * across @ across
+    expected = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)])
+    np.testing.assert_allclose(quaternion(turned), expected, atol=1e-15)
+
+
+def test_products_of_three() -> None:
+    """By their sums, written out; on views too, which are what the filter hands over."""
+    room = np.random.default_rng(2).normal(size=(4, 9))
+    for a, b in ((room[0].reshape(3, 3), room[1].reshape(3, 3)), (room[2].reshape(3, 3).T, room[3].reshape(3, 3).T)):
+        v = b[1]
+        rows = range(3)
+        assert times(a, v) == pytest.approx([sum(a[i, k] * v[k] for k in rows) for i in rows], rel=1e-14)
+        assert transposed_times(a, v) == pytest.approx([sum(a[k, i] * v[k] for k in rows) for i in rows], rel=1e-14)
+        expected = [[sum(a[i, k] * b[k, j] for k in rows) for j in rows] for i in rows]
+        np.testing.assert_allclose(matrix_product(a, b), expected, rtol=1e-13)
+
+
+def test_cross_product() -> None:
+    forward, right, down = np.eye(3)
+    for one, other, third in ((forward, right, down), (right, down, forward), (down, forward, right)):
+        assert cross(one, other).tolist() == third.tolist()
+        assert cross(other, one).tolist() == (-third).tolist()
+    a, b = RNG.normal(size=(2, 3))
+    np.testing.assert_allclose(cross(a, b), np.cross(a, b), rtol=1e-14)
 
 
 def test_euler_angles() -> None:

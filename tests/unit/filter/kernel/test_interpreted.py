@@ -115,11 +115,11 @@ def both(settings: Config, state: FilterState, events: list[Measurement]) -> tup
 def test_propagate(seed: int, wide: bool) -> None:
     rng, layout = np.random.default_rng(seed), plan(config(gnss=LEARNT if wide else {}))
     state = running_state(rng, size=layout.size)
-    twin, dt = state.copy(), float(rng.uniform(1e-6, 0.12))
+    other, dt = state.copy(), float(rng.uniform(1e-6, 0.12))
     force, rate = rng.normal(0.0, 5.0, 3) - [0, 0, 9.8], rng.normal(0.0, 0.5, 3)
     make_kernel(layout, True).propagate(state, dt, force, rate)
-    make_kernel(layout, False).propagate(twin, dt, force, rate)
-    same_state(state, twin)
+    make_kernel(layout, False).propagate(other, dt, force, rate)
+    same_state(state, other)
 
 
 def test_turns_and_pauses_of_every_size() -> None:
@@ -161,10 +161,10 @@ def test_predict(ahead_ms: int, silent_ms: int) -> None:
     """On the held sample, coasting, and one after the other."""
     layout, state = plan(config()), running_state(np.random.default_rng(2))
     state.stamps[T_IMU] = T0 - silent_ms * MS
-    twin = state.copy()
+    other = state.copy()
     make_kernel(layout, True).predict(state, T0 + ahead_ms * MS)
-    make_kernel(layout, False).predict(twin, T0 + ahead_ms * MS)
-    same_state(state, twin)
+    make_kernel(layout, False).predict(other, T0 + ahead_ms * MS)
+    same_state(state, other)
 
 
 def test_predict_leaves_a_state_that_does_not_run() -> None:
@@ -349,7 +349,7 @@ def sensed(truth: Drive, change: Change = lambda event, _: event.payload, **opti
     return held
 
 
-def twins(
+def both_kernels(
     settings: Config,
     events: list[Measurement],
     stored: StoredState | None = None,
@@ -406,7 +406,7 @@ def test_a_heading_is_chosen(speed: float) -> None:
     for until_s, stands in ((2.9, True), (4.0, False)):
         early = fuse(settings, [event for event in events if event.t_ns < T0 + until_s * SECOND], True).history.head
         assert (early.stamps[PHASE], early.stamps[T_STILL] != NEVER) == (CHOOSING, stands)
-    fusion = twins(settings, events)
+    fusion = both_kernels(settings, events)
     assert fusion.history.head.stamps[T_START] < T0 + 2 * SECOND
     assert fusion.totals()["DUPLICATE"] > 20
 
@@ -420,7 +420,7 @@ def kept(heading: float) -> StoredState:
 
 
 def test_a_hot_start_that_the_drive_contradicts() -> None:
-    fusion = twins(config(), sensed(departing(2.0, 7.0)), kept(0.5))
+    fusion = both_kernels(config(), sensed(departing(2.0, 7.0)), kept(0.5))
     assert fusion.hot_start() is Verdict.BELIEVED
     assert reset_by(fusion)[:2] == (1, ResetReason.HEADING_DECIDED)
 
@@ -457,7 +457,7 @@ def test_all_that_can_be_learnt() -> None:
         wheel={"unsigned": False, "steered": True, "position_m": (1.2, 0.8, 0.3), "correlation_s": 0.2},
         barometer={"baro": {"link": "link", "sigma_m": 0.5}},
     )
-    fusion = twins(settings, sorted(events + pressure + yaws, key=lambda event: event.key))
+    fusion = both_kernels(settings, sorted(events + pressure + yaws, key=lambda event: event.key))
     sigma = np.sqrt(np.diag(fusion.history.head.covariance))
     assert fusion.plan.size == WIDE_SIZE
     assert sigma[HEIGHT_OFFSET_ERROR][0] < 3.0  # of 100 m
@@ -478,7 +478,7 @@ def test_an_imu_that_falls_silent() -> None:
     lost = fuse(config(filter=HEADED), [event for event in events if event.t_ns < T0 + 9.9 * SECOND], True)
     assert yaw_variance(lost.history.head) > LOST_HEADING**2
     assert reset_by(lost)[0] == 0  # the hole at rest cost nothing
-    assert reset_by(twins(config(filter=HEADED), events))[:2] == (1, ResetReason.HEADING_LOST)
+    assert reset_by(both_kernels(config(filter=HEADED), events))[:2] == (1, ResetReason.HEADING_LOST)
 
 
 def test_a_frozen_imu() -> None:
@@ -493,7 +493,7 @@ def test_a_frozen_imu() -> None:
     events = sensed(town(12.0, rate=25.0), change)
     frozen = fuse(config(filter=HEADED), [event for event in events if event.t_ns < T0 + 9 * SECOND], True)
     assert frozen.beliefs(T0 + 9 * SECOND)["imu0"].status == "frozen"
-    fusion = twins(config(filter=HEADED), events)
+    fusion = both_kernels(config(filter=HEADED), events)
     assert fusion.beliefs(T0 + 12 * SECOND)["imu0"].status == "nominal"
 
 
@@ -510,7 +510,7 @@ def test_a_state_that_is_not_finite(part: str, place: int, before: str) -> None:
             getattr(head, part).flat[place] = math.nan
 
     with np.errstate(invalid="ignore"):
-        fusion = twins(config((), filter=HEADED), events, poison=poison)
+        fusion = both_kernels(config((), filter=HEADED), events, poison=poison)
     assert reset_by(fusion)[:2] == (1, ResetReason.NOT_FINITE)
     assert fusion.history.head.stamps[BLOWN] == 1
 
@@ -540,7 +540,7 @@ def test_sources_that_are_locked_out() -> None:
     events.sort(key=lambda event: event.key)
     early = fuse(settings, [event for event in events if event.t_ns < T0 + 9 * SECOND], True)
     assert reset_by(early) == (1, ResetReason.SOURCE_RETURNED, "gps0.position")
-    fusion = twins(settings, events)
+    fusion = both_kernels(settings, events)
     assert reset_by(fusion)[0] > 1
     assert fusion.outcomes()["gps0.velocity"]["REJECTED"] > 10
     assert fusion.outcomes()["baro"]["FUSED"] > 60
@@ -566,7 +566,7 @@ def test_faulty_sources() -> None:
             return WheelSpeed(wrong.get(event.source, payload.speed))
         return payload
 
-    fusion = twins(config(filter=HEADED, wheel={"noise_most": 1.5}), sensed(town(28.0, rate=25.0), change))
+    fusion = both_kernels(config(filter=HEADED, wheel={"noise_most": 1.5}), sensed(town(28.0, rate=25.0), change))
     found = fusion.beliefs(T0 + 28 * SECOND)
     assert {source: found[source].status for source in WHEELS} == {
         "rear_left": "biased",
@@ -581,7 +581,7 @@ def test_a_vehicle_that_is_carried(heading: dict[str, float]) -> None:
     """A ferry: wheels at rest while GNSS sees the vehicle move."""
     truth = drive(9.0, lambda t: 5.0 * ramp(t, 2.0, 4.0), lambda t: 0.7 + 0.1 * t, rate=25.0)
     settings = config(filter=heading | {"gnss_reset_s": 2.0, "gnss_return_s": 1.0})
-    fusion = twins(
+    fusion = both_kernels(
         settings, sensed(truth, lambda event, _: WheelSpeed(0.0) if isinstance(event.payload, WheelSpeed) else event.payload)
     )
     assert fusion.outcomes()["rear_left"]["REJECTED"] > 3
@@ -594,7 +594,7 @@ def test_a_hole_in_all_data() -> None:
     again = [
         msgspec.structs.replace(event, t_ns=event.t_ns + shift, t_receive_ns=event.t_receive_ns + shift) for event in events
     ]
-    assert reset_by(twins(config(), events + again))[:2] == (1, ResetReason.DATA_GAP)
+    assert reset_by(both_kernels(config(), events + again))[:2] == (1, ResetReason.DATA_GAP)
 
 
 @pytest.mark.parametrize("settings", [config(), config(filter={"heading_deg": 40.0})], ids=["course", "given"])
@@ -613,7 +613,7 @@ def test_events_out_of_order(settings: Config) -> None:
         if chance > 0.98:
             held.append(msgspec.structs.replace(event, sequence=event.sequence + 10**6))
     late = sorted(held, key=lambda event: (event.t_ns + 120 * MS * event.source.startswith("gps0"), event.key))
-    fusion = twins(settings, late)
+    fusion = both_kernels(settings, late)
     assert all(fusion.totals()[name] > 0 for name in ("FUSED", "REJECTED", "DUPLICATE"))
     assert fusion.history.rerun > 20
 
