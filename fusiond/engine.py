@@ -17,7 +17,8 @@ from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import ImuSample, Received
 from fusiond.filter.step import Outcome
 from fusiond.filter.stored_state import StoredState
-from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
+from fusiond.messages.from_solution import state_message
+from fusiond.messages.types import OutcomeCounts, StateMessage
 
 SECOND = 1_000_000_000  # ns
 LONGEST_SILENCE_NS = 60 * SECOND  # ticks go on for so long after an event; a longer hole is passed over

@@ -16,6 +16,7 @@ from msgspec import Meta, Struct
 
 from fusiond.config.schema import Config
 from fusiond.config.sensor import INERTIAL
+from fusiond.messages.codec import encode
 from fusiond.messages.local_frame import ENU_FLU, LocalFrame
 from fusiond.messages.types import (
     MESSAGES,
@@ -28,7 +29,6 @@ from fusiond.messages.types import (
     State,
     StateAtInstant,
     StateMessage,
-    encode,
 )
 
 SECOND = 1_000_000_000  # ns

@@ -20,8 +20,9 @@ import zenoh.ext
 
 from fusiond.config.schema import Encoding
 from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.messages.codec import encode
 from fusiond.messages.keys import key as key_of
-from fusiond.messages.types import MESSAGES, InnovationMessage, Message, encode
+from fusiond.messages.types import MESSAGES, InnovationMessage, Message
 
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}

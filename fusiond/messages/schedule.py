@@ -24,6 +24,7 @@ from fusiond.filter.calibration import calibrations
 from fusiond.filter.hot_start import decided
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
+from fusiond.messages.from_solution import settled_message
 from fusiond.messages.innovations import Innovations
 from fusiond.messages.types import (
     Calibration,
@@ -40,7 +41,6 @@ from fusiond.messages.types import (
     SourceHealth,
     SourceStatus,
     StateMessage,
-    settled_message,
 )
 from fusiond.timeline.clock import ClockReport
 

@@ -1,21 +1,17 @@
-"""The published messages: their types, their encodings, their JSON Schema, and the CSV row of a publication.
+"""The types of the published messages, with the meaning and unit of every field.
 
-A message is built once from an estimate, degrees and all; both encodings and the CSV row are made from its numbers, so
-they agree bit for bit. No message ever carries a number that is not finite. Messages are immutable, so whoever holds one
-holds state and covariance of one instant: nothing can change under a reader, in whatever thread.
+No message carries a number that is not finite. Messages are immutable: a reader in any thread sees the state and the
+covariance of one instant.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-import msgspec
 from msgspec import Meta, Struct
 
 from fusiond.config.schema import Encoding
-from fusiond.estimator.solution import ATTITUDE, POSITION, VELOCITY, Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import Mode
 
 SCHEMA_VERSION = 1  # raised when a field changes its meaning, its unit or its type, or goes; not when one is added
 
@@ -274,177 +270,3 @@ MESSAGES: dict[str, type[Message]] = {  # by the last part of the key; of innova
     "info": InfoMessage,
     "config": ConfigMessage,
 }
-
-
-def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
-    """The message that tells of an estimate.
-
-    A state with a number that is not finite, or with a negative variance, is withheld: the message then has mode
-    `lost`, no state, and says in `fault` which number was to blame. So the publication goes on, and a reader sees why.
-    """
-    return _told(StateMessage, estimate, vehicle, outcomes)
-
-
-def settled_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
-    """The same of an estimate at the horizon."""
-    return _told(SettledMessage, estimate, vehicle, outcomes)
-
-
-AnyState = TypeVar("AnyState", bound=StateAtInstant)
-
-
-def _told(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
-    state, fault = _checked(estimate.state) if estimate.state is not None else (None, None)
-    return kind(
-        vehicle=vehicle,
-        t_ns=estimate.t_ns,
-        mode=Mode.LOST if fault else estimate.mode,
-        age_ms=None if estimate.age_ns is None else estimate.age_ns / 1e6,
-        resets=estimate.resets,
-        fault=fault,
-        state=state,
-        outcomes=outcomes,
-    )
-
-
-def _checked(estimate: StateEstimate) -> tuple[State | None, str | None]:
-    """The published state, or None and what is wrong with it."""
-    if not all(variance >= 0 for variance in estimate.covariance.diagonal().tolist()):
-        return None, "covariance: a variance is negative or not a number"
-    state = _published(estimate)
-    values = [value if isinstance(value, tuple) else (value,) for value in msgspec.structs.astuple(state)]
-    if math.isfinite(sum(map(sum, values))):
-        return state, None
-    for name, value in zip(state.__struct_fields__, values, strict=True):
-        if not all(map(math.isfinite, value)):
-            return None, f"{name}: not finite"
-    return state, None
-
-
-def _published(estimate: StateEstimate) -> State:
-    """The state in the units of the message. Raises ValueError on a negative variance."""
-    roll, pitch, yaw = estimate.euler()
-    return State(
-        lat_deg=math.degrees(estimate.latitude),
-        lon_deg=math.degrees(estimate.longitude),
-        height_m=float(estimate.height),
-        velocity_ned_mps=_triple(estimate.velocity_n),
-        quaternion_nb=_quaternion(estimate.quaternion_nb),
-        roll_deg=math.degrees(roll),
-        pitch_deg=math.degrees(pitch),
-        yaw_deg=math.degrees(yaw),
-        angular_rate_b_rps=_triple(estimate.angular_rate_b),
-        acceleration_b_mps2=_triple(estimate.acceleration_b),
-        gyro_bias_rps=_triple(estimate.gyro_bias),
-        accel_bias_mps2=_triple(estimate.accel_bias),
-        wheel_scale=float(estimate.wheel_scale),
-        mount_deg=_degrees(estimate.mount),
-        covariance_position_m2=_block(estimate, POSITION),
-        covariance_velocity_m2ps2=_block(estimate, VELOCITY),
-        covariance_attitude_rad2=_block(estimate, ATTITUDE),
-        sigma_position_ned_m=estimate.sigma_position_n(),
-        sigma_velocity_mps=estimate.sigma_velocity(),
-        sigma_yaw_deg=math.degrees(estimate.sigma_yaw()),
-        sigma_gyro_bias_rps=_triple(estimate.sigma_gyro_bias),
-        sigma_accel_bias_mps2=_triple(estimate.sigma_accel_bias),
-        sigma_wheel_scale=float(estimate.sigma_wheel_scale),
-        sigma_mount_deg=_degrees(estimate.sigma_mount),
-    )
-
-
-# NumPy's scalars pass for floats, but msgspec refuses them and their repr is not a number's: hence float() below.
-
-
-def _triple(vector: Triple) -> Triple:
-    x, y, z = vector
-    return float(x), float(y), float(z)
-
-
-def _quaternion(quaternion: Quaternion) -> Quaternion:
-    w, x, y, z = quaternion
-    return float(w), float(x), float(y), float(z)
-
-
-def _degrees(angles: tuple[float, float]) -> tuple[float, float]:
-    return math.degrees(angles[0]), math.degrees(angles[1])
-
-
-def _block(estimate: StateEstimate, block: slice) -> Block:
-    """Symmetric to the last bit, which the turn into n leaves open."""
-    a, b, c, d, e, f, g, h, i = estimate.covariance[block, block].ravel().tolist()
-    b, c, f = (b + d) / 2, (c + g) / 2, (f + h) / 2
-    return a, b, c, b, e, f, c, f, i
-
-
-# --- Encodings
-
-AnyMessage = TypeVar("AnyMessage", bound=Message)
-
-_json = msgspec.json.Encoder()
-_msgpack = msgspec.msgpack.Encoder()
-
-
-def encode(message: Message, encoding: Encoding) -> bytes:
-    """The bytes of a message. JSON numbers are the shortest that read back as the same float."""
-    return _json.encode(message) if encoding == "json" else _msgpack.encode(message)
-
-
-def decode(data: bytes, kind: type[AnyMessage], encoding: Encoding) -> AnyMessage:
-    """The message in the bytes; fields it does not know are passed over. Raises msgspec.DecodeError."""
-    return msgspec.json.decode(data, type=kind) if encoding == "json" else msgspec.msgpack.decode(data, type=kind)
-
-
-def schemas() -> Iterator[tuple[str, bytes]]:
-    """File name and text of each message's JSON Schema, as kept in docs/schema/."""
-    for name, kind in MESSAGES.items():
-        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(kind)}
-        yield f"{name}.schema.json", msgspec.json.format(msgspec.json.encode(schema), indent=2) + b"\n"
-
-
-# --- CSV
-
-CSV_COLUMNS = (
-    "unix_us",
-    "lat_deg",
-    "lon_deg",
-    "height_m",
-    "vn_mps",
-    "ve_mps",
-    "vd_mps",
-    "roll_deg",
-    "pitch_deg",
-    "yaw_deg",
-    "sigma_n_m",
-    "sigma_e_m",
-    "sigma_d_m",
-    "sigma_v_mps",
-    "sigma_yaw_deg",
-    "mode",
-)
-
-
-def csv_header() -> str:
-    """The line that names the columns, without its end."""
-    return ",".join(CSV_COLUMNS)
-
-
-def csv_row(message: StateMessage) -> str:
-    """One line, without its end. Numbers are the shortest that read back as the same float; no state, empty cells."""
-    numbers = _csv_numbers(message.state) if message.state else [""] * (len(CSV_COLUMNS) - 2)
-    return ",".join([str(message.t_ns // 1000), *numbers, message.mode.value])
-
-
-def _csv_numbers(state: State) -> Iterable[str]:
-    numbers = (
-        state.lat_deg,
-        state.lon_deg,
-        state.height_m,
-        *state.velocity_ned_mps,
-        state.roll_deg,
-        state.pitch_deg,
-        state.yaw_deg,
-        *state.sigma_position_ned_m,
-        state.sigma_velocity_mps,
-        state.sigma_yaw_deg,
-    )
-    return map(repr, numbers)

@@ -23,7 +23,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fusiond.config.schema import Config
 from fusiond.estimator.solution import Estimate, Mode, StateEstimate
 from fusiond.maths.rotation import matrix_from_euler, quaternion
-from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
+from fusiond.messages.from_solution import state_message
+from fusiond.messages.types import OutcomeCounts, StateMessage
 from fusiond.ports.inputs import Inbox
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.mavlink.link import MavlinkLink

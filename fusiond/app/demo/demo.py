@@ -28,7 +28,8 @@ from fusiond.app.replay.replay import Options, OutputError, replay
 from fusiond.app.replay.summary import Stretch, Summary
 from fusiond.config import load as config
 from fusiond.config.schema import Config
-from fusiond.messages.types import StateMessage, csv_row
+from fusiond.messages.csv import csv_row
+from fusiond.messages.types import StateMessage
 from fusiond_adapters.can.bus import CanBus
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs.play import PlayedClock, Player

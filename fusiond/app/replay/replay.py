@@ -33,8 +33,9 @@ from fusiond.events import ClockPair, Received
 from fusiond.filter.hot_start import WORDS, Verdict
 from fusiond.filter.step import Outcome
 from fusiond.filter.stored_state import StoredState, StoredStateError, check
+from fusiond.messages.csv import csv_header, csv_row
 from fusiond.messages.schedule import Publication
-from fusiond.messages.types import Message, StateMessage, csv_header, csv_row
+from fusiond.messages.types import Message, StateMessage
 from fusiond_adapters.logs import LogError
 from fusiond_adapters.logs.merge import open_logs
 

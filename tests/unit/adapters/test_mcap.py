@@ -19,7 +19,9 @@ import pytest
 from fusiond.__main__ import SUCCESS, UNUSABLE, USAGE, main
 from fusiond.config.schema import Config, Mcap
 from fusiond.estimator.solution import Mode
-from fusiond.messages.types import EventMessage, HealthMessage, InnovationMessage, Message, StateMessage, csv_row, decode
+from fusiond.messages.codec import decode
+from fusiond.messages.csv import csv_row
+from fusiond.messages.types import EventMessage, HealthMessage, InnovationMessage, Message, StateMessage
 from tests.helpers.drive import LOGS, folder, messages, settings
 from tests.helpers.live import Autopilot, configuration, running
 from tests.unit.app.live.test_daemon import aligned, free_port, udp

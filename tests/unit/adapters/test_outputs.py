@@ -23,6 +23,7 @@ from fusiond.config.schema import Config, Zenoh
 from fusiond.engine import SECOND, Engine
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Received
 from fusiond.filter.step import Outcome
+from fusiond.messages.codec import encode
 from fusiond.messages.innovations import NAMES
 from fusiond.messages.schedule import Publication
 from fusiond.messages.types import (
@@ -35,7 +36,6 @@ from fusiond.messages.types import (
     SettledMessage,
     StateAtInstant,
     StateMessage,
-    encode,
 )
 from fusiond.ports.outputs import Outbox, OutputLost
 from fusiond_adapters.logs.merge import open_logs

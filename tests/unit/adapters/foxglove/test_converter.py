@@ -21,7 +21,8 @@ import pytest
 from fusiond.config.explain import description
 from fusiond.config.schema import Foxglove, Mcap, Prometheus
 from fusiond.config.toml import ConfigError
-from fusiond.messages.types import EventMessage, HealthMessage, State, StateMessage, encode
+from fusiond.messages.codec import encode
+from fusiond.messages.types import EventMessage, HealthMessage, State, StateMessage
 from fusiond.ports.outputs import OutputLost
 from fusiond_adapters.foxglove import layout as foxglove_layout
 from fusiond_adapters.foxglove.converter import FOXGLOVE, LOG, POSE, TOPICS, Converter, channels, innovations_topic

@@ -18,7 +18,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
 from fusiond.app.replay.replay import Replay, Wants
-from fusiond.messages.types import encode
+from fusiond.messages.codec import encode
 from fusiond.timeline.clock import ClockReport
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers.live import DEADLINE, SYSTEM, Running, configuration, running

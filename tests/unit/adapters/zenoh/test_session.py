@@ -17,7 +17,10 @@ import zenoh
 
 from fusiond.config.schema import Encoding, Zenoh
 from fusiond.estimator.solution import Estimate, Mode, StateEstimate
-from fusiond.messages.types import OutcomeCounts, StateMessage, csv_row, encode, state_message
+from fusiond.messages.codec import encode
+from fusiond.messages.csv import csv_row
+from fusiond.messages.from_solution import state_message
+from fusiond.messages.types import OutcomeCounts, StateMessage
 from fusiond_adapters.zenoh.session import (
     CONTENT_TYPES,
     PublishError,

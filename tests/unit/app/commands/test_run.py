@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fusiond.messages.types import StateMessage, decode
+from fusiond.messages.codec import decode
+from fusiond.messages.types import StateMessage
 from tests.helpers.live import DEADLINE, Autopilot, configuration
 
 

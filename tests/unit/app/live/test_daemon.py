@@ -23,7 +23,8 @@ from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
-from fusiond.messages.types import StateMessage, encode
+from fusiond.messages.codec import encode
+from fusiond.messages.types import StateMessage
 from fusiond_adapters.can.bus import CanBus
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers.live import DEADLINE, SYSTEM, Autopilot, Running, configuration, parsed, running

@@ -19,7 +19,9 @@ from fusiond.engine import Engine
 from fusiond.errors import UsageError
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import GnssPosition, ImuSample, Invalid, Received, WheelSpeed
-from fusiond.messages.types import OutcomeCounts, StateMessage, csv_row, state_message
+from fusiond.messages.csv import csv_row
+from fusiond.messages.from_solution import state_message
+from fusiond.messages.types import OutcomeCounts, StateMessage
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
