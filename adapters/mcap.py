@@ -24,8 +24,9 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.messages.info import config_table
 from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.units import SECOND
 from fusiond_adapters.foxglove.converter import SHOWN, Channel, Converter, Record, channels
-from fusiond_adapters.logs.black_box import FLUSH_S, MEGABYTE, file_name, make_room
+from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, file_name, make_room, name_pattern
 
 try:
     from mcap import records
@@ -36,12 +37,11 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("MCAP files need the extra mcap: pip install 'fusiond[mcap]'") from missing
 
-SECOND = 1_000_000_000  # ns
 CHUNK_BYTES = 1 << 20  # a chunk ends here at the latest
 LIBRARY = f"fusiond {__version__}"
 KIND = "fusion.mcap"
-NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-fusion\.mcap")  # nothing else in the folder is ever removed
-MOST_WAITING = 4096  # messages between the estimator and the disk
+NAME = name_pattern(re.escape(KIND))  # nothing else in the folder is ever removed
+MAX_WAITING = 4096  # messages between the estimator and the disk
 
 
 class McapFile:
@@ -167,7 +167,7 @@ class McapRecorder:
 
     def __init__(self, config: Config, folder: Path) -> None:
         self.about = f"MCAP files in {folder}"
-        self.outbox = Outbox(MOST_WAITING, SHOWN)
+        self.outbox = Outbox(MAX_WAITING, SHOWN)
         self.lost = self.files = 0
         self._folder, self._config = folder, config
         section = config.mcap

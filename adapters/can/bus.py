@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
+from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import Inbox
 from fusiond_adapters.can.kernel_socket import CanFrame
-from fusiond_adapters.host.clock import HostClock
 
 if TYPE_CHECKING:
     from fusiond_adapters.can.decoder import CanDecoder
@@ -31,7 +31,7 @@ log = logging.getLogger("fusiond")
 class CanBus:
     """One [can.NAME]."""
 
-    def __init__(self, config: Config, bus: str, inbox: Inbox[CanFrame], clock: HostClock) -> None:
+    def __init__(self, config: Config, bus: str, inbox: Inbox[CanFrame], clock: Clock) -> None:
         self.name = bus
         self.file = "can.log"
         self.inbox = inbox

@@ -17,10 +17,10 @@ from typing import Any
 import can
 
 from fusiond.config.schema import Can
+from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputLost
 from fusiond_adapters.can.decoder import EXTENDED, PDU2, CanDecoder
 from fusiond_adapters.can.kernel_socket import CanFrame, CanSocket
-from fusiond_adapters.host.clock import HostClock
 
 ID_BITS = 0x1FFFFFFF
 STANDARD_BITS = 0x7FF
@@ -31,7 +31,7 @@ BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
 class CanDriver:
     """Opens and reads the bus of whose frames `decoder` finds the wheels."""
 
-    def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: HostClock) -> None:
+    def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: Clock) -> None:
         self._decoder, self._inbox, self._clock = decoder, inbox, clock
 
     @contextmanager

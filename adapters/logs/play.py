@@ -18,8 +18,8 @@ import can
 
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs import LogInput
-from fusiond_adapters.logs.tlog import STAMP, STAMP_SIZE
 from fusiond_adapters.mavlink.decoder import frame_length
+from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
 SHORTEST_S = 0.0005  # no sleep is shorter: records that are due within this are sent together
 BEHIND_NS = 20_000_000  # a daemon that has fallen behind by more is waited for

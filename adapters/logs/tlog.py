@@ -29,9 +29,8 @@ from fusiond_adapters.mavlink.decoder import (
     MavlinkDecoder,
     frame_length,
 )
+from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
-STAMP = Struct(">Q")  # microseconds of Unix time
-STAMP_SIZE = STAMP.size
 RECORD_2 = Struct(">Q10B")  # stamp, and the header of a MAVLink 2 frame
 OVERHEAD = STAMP_SIZE + HEADER_2 + CHECKSUM  # bytes of a MAVLink 2 record without its payload
 OVERHEAD_SIGNED = OVERHEAD + SIGNATURE

@@ -10,11 +10,11 @@ from typing import Any
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.events import Received
+from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput
-from fusiond_adapters.host.clock import HostClock
-from fusiond_adapters.logs.tlog import STAMP
 from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder
 from fusiond_adapters.mavlink.talk import MavlinkTalk
+from fusiond_adapters.mavlink.tlog_record import tlog_record
 from fusiond_adapters.mavlink.transport import Transport, opener
 
 log = logging.getLogger("fusiond")
@@ -28,7 +28,7 @@ class MavlinkLink:
     """
 
     def __init__(
-        self, config: Config, link: str, inbox: Inbox[bytes], clock: HostClock, alive: Callable[[], bool]
+        self, config: Config, link: str, inbox: Inbox[bytes], clock: Clock, alive: Callable[[], bool]
     ) -> None:
         self.name = link
         self.file = f"{link}.tlog"
@@ -112,7 +112,7 @@ class MavlinkLink:
 
     def record(self, item: bytes, t_ns: int) -> bytes:
         """A record of a .tlog."""
-        return STAMP.pack(t_ns // 1000) + item
+        return tlog_record(item, t_ns)
 
     def counts(self) -> dict[str, int]:
         """What became of the frames so far, and of the link."""

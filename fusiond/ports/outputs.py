@@ -16,8 +16,8 @@ from typing import Any, Protocol
 from fusiond.config.schema import Config
 from fusiond.messages.latency import RecentLatencies
 from fusiond.messages.types import Message, StateMessage
+from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import LiveInput
-from fusiond_adapters.host.clock import HostClock
 
 POLL_S = 0.2  # how long an output's thread waits for messages before it looks whether it is to stop
 
@@ -105,7 +105,7 @@ class LiveOutput(Protocol):
 class Around:
     """What an output may build on besides the configuration."""
 
-    clock: HostClock  # the time line of all stamps
+    clock: Clock  # the time line of all stamps
     inputs: Mapping[str, LiveInput[Any]]  # by kind and name, such as mavlink.fc: to answer on the link one hears
 
 

@@ -14,7 +14,7 @@ import pytest
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs import play
 from fusiond_adapters.logs.play import PlayedClock, Player, can_records, mavlink_records
-from fusiond_adapters.logs.tlog import STAMP
+from fusiond_adapters.mavlink.tlog_record import tlog_record
 from tests.helpers.live import Autopilot
 
 BEGIN_NS = 1_760_000_000_000_000_000
@@ -29,7 +29,7 @@ def logs(tmp_path: Path) -> tuple[Path, Path]:
     autopilot = Autopilot()
     stamps = [BEGIN_NS + number * STEP_NS for number in range(FRAMES)]
     tlog, canlog = tmp_path / "drive.tlog", tmp_path / "drive.log"
-    tlog.write_bytes(b"".join(STAMP.pack(t_ns // 1000) + autopilot.imu() for t_ns in stamps))
+    tlog.write_bytes(b"".join(tlog_record(autopilot.imu(), t_ns) for t_ns in stamps))
     half = STEP_NS // 2
     lines = (f"({(t + half) // 10**9}.{(t + half) % 10**9 // 1000:06d}) can0 10{n}#0{n}\n" for n, t in enumerate(stamps))
     canlog.write_text("".join(lines))
