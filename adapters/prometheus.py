@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from threading import Event
 from typing import Any
 
@@ -13,7 +13,7 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
 
 try:
     from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
@@ -89,6 +89,11 @@ class PrometheusServer:
             self._delays.labels(message.source).observe((message.t_receive_ns - message.t_ns) / 1e9)
             if message.test_ratio is not None:
                 self._ratios.labels(message.source).observe(message.test_ratio)
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [PrometheusServer(config)]
 
 
 class Latest(Collector):  # type: ignore[misc]  # Any, where the extra is missing

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
+from operator import attrgetter
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
-from fusiond.ports.inputs import Inbox
+from fusiond.ports.inputs import Inbox, LiveInput, Receiver
 from fusiond_adapters.can.kernel_socket import CanFrame
 
 if TYPE_CHECKING:
@@ -116,3 +118,13 @@ class CanBus:
         own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
         decoded = self.decoder.counts if self.decoder else {}
         return {**own, **{name: count for name, count in self._seen.items() if count}, **decoded}
+
+
+def make(config: Config, receiver: Receiver) -> Sequence[LiveInput[Any]]:
+    """The bus of each [can.NAME]."""
+
+    def bus(name: str) -> CanBus:
+        inbox = Inbox(config.live.queue_frames, receiver.wake, attrgetter("arbitration_id"))
+        return CanBus(config, name, inbox, receiver.clock)
+
+    return [bus(name) for name in config.can]

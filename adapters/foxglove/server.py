@@ -5,11 +5,12 @@ The server is the SDK's own, in threads outside Python; to a client that is slow
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from threading import Event
 
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
 from fusiond_adapters.foxglove.converter import SHOWN, Converter, channels
 
 try:
@@ -80,3 +81,8 @@ class FoxgloveServer:
                     self.shown += 1
         for topic in topics.values():
             topic.close()
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [FoxgloveServer(config)]

@@ -12,14 +12,12 @@ from typing import TypeVar
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
-from fusiond_adapters.can.decoder import CanDecoder
-from fusiond_adapters.logs import LogError, LogInput, canlog
-from fusiond_adapters.logs.canlog import read_can_log
-from fusiond_adapters.logs.tlog import read_tlog
-from fusiond_adapters.mavlink.decoder import MavlinkDecoder
+from fusiond.units import SECOND
+from fusiond_adapters.logs.file import LogError, LogFile
+from fusiond_adapters.logs.format import Opening, Reading
+from fusiond_adapters.registry import LOG_FORMATS
 
 READ_AHEAD = 512  # events
-KNOWN = ".tlog, .log (candump -L), .asc, .blf, .trc, .csv, .db, .mf4; all but .db and .mf4 also with .gz"
 
 Item = TypeVar("Item")
 
@@ -27,8 +25,8 @@ Item = TypeVar("Item")
 def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
     """Make ready to read the logs of one drive. Nothing but their size is looked at yet.
 
-    A path is that of a .tlog or a CAN log, by its suffix. A .tlog belongs to the first [mavlink.NAME]; a CAN log may
-    hold any [can.NAME], told apart by channel (see `canlog`). `LINK=path` or `BUS=path` says whose it is.
+    The suffix of a path gives the format. A .tlog belongs to the first [mavlink.NAME]; a CAN log may hold any [can.NAME],
+    told apart by channel (see `can_channels`). `LINK=path` or `BUS=path` says which it is.
     Raises LogError for a path that cannot be a log, ConfigError for a configuration that does not fit its DBC files.
     """
     if not paths:
@@ -77,8 +75,8 @@ class LogSet:
         """What the user should know about the logs, complete once they are read."""
         found = [warning for log in self._logs for warning in log.file.warnings]
         found += [f"{log.file.path}: nothing in it that the configuration asks for" for log in self._logs if log.barren]
-        links = [log for log in self._logs if log.first_ns is not None and log.is_mavlink]
-        buses = [log for log in self._logs if log.first_ns is not None and not log.is_mavlink]
+        links = [log for log in self._logs if log.first_ns is not None and log.protocol == "mavlink"]
+        buses = [log for log in self._logs if log.first_ns is not None and log.protocol == "can"]
         if links and buses and not any(link.overlaps(bus) for link in links for bus in buses):
             spans = "; ".join(log.span() for log in (*links, *buses))
             found.append(f"the MAVLink and the CAN logs do not overlap in time: {spans}")
@@ -95,21 +93,18 @@ def _ahead(items: Iterator[Item]) -> Iterator[Item]:
 class _Log:
     """One log, its decoders, and the stamps seen in it."""
 
-    def __init__(
-        self, file: LogInput, decoders: Sequence[MavlinkDecoder | CanDecoder], frames: Iterator[list[Received]]
-    ) -> None:
+    def __init__(self, file: LogFile, reading: Reading) -> None:
         self.file = file
-        self.is_mavlink = isinstance(decoders[0], MavlinkDecoder)
+        self.protocol = reading.protocol
         self.first_ns: int | None = None
         self.last_ns = 0
         self.barren = False  # read to its end without an event
-        self._decoders = decoders
-        self._frames = frames  # the events of each
+        self._reading = reading
 
     def placed(self) -> Iterator[tuple[int, list[Received]]]:
         """The events of each frame, with the greatest receive stamp so far."""
         latest_ns: int | None = None
-        for events in self._frames:
+        for events in self._reading.frames:
             if not events:
                 continue
             t_ns = events[0].t_receive_ns
@@ -126,7 +121,7 @@ class _Log:
 
     def counts(self) -> dict[str, int]:
         total = self.file.counts.copy()
-        for decoder in self._decoders:
+        for decoder in self._reading.decoders:
             total.update(decoder.counts)
         return {name: count for name, count in total.items() if count}
 
@@ -141,30 +136,23 @@ class _Log:
 
 
 def _readable(t_ns: int) -> str:
-    seconds = t_ns // 10**9
+    seconds = t_ns // SECOND
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _open(argument: str, config: Config, sequences: dict[str, int]) -> _Log:
     name, path = _split(argument, config)
-    file = LogInput(path)
-    if file.suffix == ".tlog":
-        if not config.mavlink:
-            raise LogError(f"{path}: the configuration has no [mavlink.NAME] to take it for")
-        link = name if name is not None else next(iter(config.mavlink))
-        if link not in config.mavlink:
-            raise LogError(f"{argument}: a .tlog is a MAVLink log; configured links: {', '.join(config.mavlink)}")
-        decoder = MavlinkDecoder(config, link, sequences)
-        return _Log(file, [decoder], read_tlog(file, decoder))
-    if file.suffix not in canlog.SUFFIXES or (file.zipped and file.suffix in canlog.UNZIPPED_ONLY):
-        raise LogError(f"{path}: unknown kind of log; known: {KNOWN}")
-    if not config.can:
-        raise LogError(f"{path}: the configuration has no [can.NAME] to take it for")
-    if name is not None and name not in config.can:
-        raise LogError(f"{argument}: a {file.suffix} is a CAN log; configured buses: {', '.join(config.can)}")
-    buses = config.can if name is None else (name,)
-    decoders = {bus: CanDecoder(config, bus, sequences) for bus in buses}
-    return _Log(file, list(decoders.values()), read_can_log(file, decoders, config, named=name is not None))
+    file = LogFile(path)
+    for kind in LOG_FORMATS:
+        if kind.suffix == file.suffix and (kind.zipped or not file.zipped):
+            return _Log(file, kind.open(Opening(file, kind.about, name, config, sequences)))
+    raise LogError(f"{path}: unknown kind of log; known: {_known()}")
+
+
+def _known() -> str:
+    known = ", ".join(f"{kind.suffix} ({kind.about})" for kind in LOG_FORMATS)
+    unzipped = " and ".join(kind.suffix for kind in LOG_FORMATS if not kind.zipped)
+    return f"{known}; all but {unzipped} also with .gz"
 
 
 def _split(argument: str, config: Config) -> tuple[str | None, str]:

@@ -17,7 +17,7 @@ from typing import Any
 import can
 
 from fusiond_adapters.host.clock import HostClock
-from fusiond_adapters.logs import LogInput
+from fusiond_adapters.logs.file import LogFile
 from fusiond_adapters.mavlink.decoder import frame_length
 from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
@@ -50,7 +50,7 @@ class PlayedClock(HostClock):
 
 def mavlink_records(path: Path) -> Iterator[tuple[int, bytes]]:
     """Stamp [ns] and frame of each record of an undamaged .tlog (or .tlog.gz). Raises LogError."""
-    data = b"".join(LogInput(path).blocks())
+    data = b"".join(LogFile(path).blocks())
     at = 0
     while at + STAMP_SIZE < len(data):
         (stamp_us,) = STAMP.unpack_from(data, at)

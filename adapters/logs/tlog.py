@@ -15,7 +15,8 @@ from collections.abc import Generator, Iterator
 from struct import Struct
 
 from fusiond.events import Received
-from fusiond_adapters.logs import LogError, LogInput
+from fusiond_adapters.logs.file import LogError, LogFile
+from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.decoder import (
     CHECKSUM,
     HEADER_2,
@@ -41,7 +42,20 @@ STEP_US = 10**6  # a stamp that jumps by more is compared with the next one
 REACH = 2 * (STAMP_SIZE + LONGEST_FRAME)  # bytes in which a whole record and the next one's beginning lie
 
 
-def read_tlog(log: LogInput, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
+def open_log(opening: Opening) -> Reading:
+    """The reading of a .tlog, by default of the first link. Raises LogError where no link is configured, or not that one;
+    ConfigError where the dialect lacks a wanted message."""
+    path, links = opening.file.path, opening.config.mavlink
+    if not links:
+        raise LogError(f"{path}: the configuration has no [mavlink.NAME] for it")
+    link = next(iter(links)) if opening.name is None else opening.name
+    if link not in links:
+        raise LogError(f"{link}={path}: a .tlog is a MAVLink log; configured links: {', '.join(links)}")
+    decoder = MavlinkDecoder(opening.config, link, opening.sequences)
+    return Reading("mavlink", [decoder], read_tlog(opening.file, decoder))
+
+
+def read_tlog(log: LogFile, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
     """The events of a .tlog, frame by frame in the order of the file. Raises LogError where there is no MAVLink in it."""
     yield from _Records(log, decoder)
     if not log.counts["records"]:
@@ -51,7 +65,7 @@ def read_tlog(log: LogInput, decoder: MavlinkDecoder) -> Iterator[list[Received]
 class _Records:
     """Cuts a .tlog into records and has them decoded."""
 
-    def __init__(self, log: LogInput, decoder: MavlinkDecoder) -> None:
+    def __init__(self, log: LogFile, decoder: MavlinkDecoder) -> None:
         self._blocks = log.blocks()
         self._counts = log.counts
         self._decoder, self._dialect = decoder, decoder.dialect

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from threading import Event, Lock
 from typing import Any
 
@@ -11,8 +11,8 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
-from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput
-from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder
+from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput, Receiver
+from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder, message_id
 from fusiond_adapters.mavlink.talk import MavlinkTalk
 from fusiond_adapters.mavlink.tlog_record import tlog_record
 from fusiond_adapters.mavlink.transport import Transport, opener
@@ -121,6 +121,16 @@ class MavlinkLink:
         rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.talk.wanted.items()}
         signing = self.talk.signing.counts if self.talk.signing else {}
         return {**own, "reboots": self.talk.reboots, **asked, **rates, **signing, **self.decoder.counts}
+
+
+def make(config: Config, receiver: Receiver) -> Sequence[LiveInput[Any]]:
+    """The link of each [mavlink.NAME]."""
+
+    def link(name: str) -> MavlinkLink:
+        inbox: Inbox[bytes] = Inbox(config.live.queue_frames, receiver.wake, message_id)
+        return MavlinkLink(config, name, inbox, receiver.clock, receiver.is_alive)
+
+    return [link(name) for name in config.mavlink]
 
 
 def link_of(inputs: Mapping[str, LiveInput[Any]], name: str) -> MavlinkLink:

@@ -6,7 +6,7 @@ A Zenoh session of its own, by default a client of the router that rmw_zenoh nee
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from threading import Event
 
 import zenoh
@@ -15,7 +15,7 @@ from fusiond.config.schema import Config, Ros2
 from fusiond.config.schema import Zenoh as ZenohSection
 from fusiond.config.toml import ConfigError
 from fusiond.messages.types import HealthMessage, Message, StateMessage
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
 from fusiond_adapters.zenoh.session import PublishError, open_session
 
 try:
@@ -101,3 +101,8 @@ class Ros2Output:
 
 def _connected(session: zenoh.Session) -> bool:
     return bool(session.info.routers_zid() or session.info.peers_zid())
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [Ros2Output(config)]

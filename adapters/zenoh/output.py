@@ -6,6 +6,7 @@ which on a busy machine is what a state loses most by. Zenoh only queues it, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from threading import Event
 
@@ -13,7 +14,7 @@ import zenoh
 
 from fusiond.config.schema import Config
 from fusiond.messages.types import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant, StateMessage
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
 from fusiond_adapters.zenoh.queries import Answers
 from fusiond_adapters.zenoh.session import PublishError, ZenohPublisher, open_session
 
@@ -100,3 +101,8 @@ class ZenohOutput:
     def notes(self) -> dict[str, str]:
         """To whom it is connected."""
         return self._notes
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [ZenohOutput(config)]

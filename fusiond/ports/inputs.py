@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from threading import Event, Lock
 from typing import Generic, Protocol, TypeVar
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
+from fusiond.ports.clock import Clock
 
 Item = TypeVar("Item")
 THIN = 3  # a full inbox loses one in so many: gaps of two, four, eight would make a rolling counter stand still
@@ -106,3 +108,14 @@ class LiveInput(Protocol[Item]):
 
     def counts(self) -> dict[str, int]:
         """What became of the frames so far."""
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """What an input works for: the part of the daemon that takes its frames."""
+
+    clock: Clock  # stamps the receipts
+    wake: Callable[[], None]  # called when an empty inbox fills
+    is_alive: Callable[[], bool]  # whether the estimator works: an input answers its peer only then
+
+

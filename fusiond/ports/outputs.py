@@ -8,12 +8,11 @@ An output whose sending never waits may have states handed to it at once instead
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from threading import Condition, Event
 from typing import Any, Protocol
 
-from fusiond.config.schema import Config
 from fusiond.messages.latency import RecentLatencies
 from fusiond.messages.types import Message, StateMessage
 from fusiond.ports.clock import Clock
@@ -109,4 +108,3 @@ class Around:
     inputs: Mapping[str, LiveInput[Any]]  # by kind and name, such as mavlink.fc: to answer on the link one hears
 
 
-Factory = Callable[[Config, Around], Sequence[LiveOutput]]  # raises ConfigError, also where an extra is missing

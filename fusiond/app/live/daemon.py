@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from operator import attrgetter
 from threading import Event, current_thread
 from typing import Any
 
@@ -37,21 +36,17 @@ from fusiond.messages.types import (
     OutputHealth,
     StateMessage,
 )
-from fusiond.ports.inputs import Inbox, InputLost, LiveInput
+from fusiond.ports.inputs import InputLost, LiveInput, Receiver
 from fusiond.ports.outputs import Around, LiveOutput, OutputLost
-from fusiond_adapters.can.bus import CanBus
 from fusiond_adapters.host import journal
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.host.systemd import Notifier, watchdog_s
 from fusiond_adapters.logs.black_box import Recorder
-from fusiond_adapters.mavlink.decoder import message_id
-from fusiond_adapters.mavlink.link import MavlinkLink
-from fusiond_adapters.registry import make_outputs
+from fusiond_adapters.registry import make_inputs, make_outputs
 
 FIRST_PAUSE_S = 0.1  # before what was lost is opened again; doubled each time, up to live.reopen_max_s
 STEADY_S = 10.0  # what lasted so long begins anew with the first pause
 SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
-CAN_ID = attrgetter("arbitration_id")
 REPORT_S = 10.0  # between two lines about losses, while there are any
 
 LEVEL = {"info": logging.INFO, "notice": logging.INFO, "warning": logging.WARNING, "critical": logging.CRITICAL}
@@ -155,13 +150,7 @@ class Daemon:
     # --- Inputs
 
     def _make_inputs(self, config: Config) -> dict[str, LiveInput[Any]]:
-        size = config.live.queue_frames
-        links = [
-            MavlinkLink(config, link, Inbox(size, self._wake.set, message_id), self.clock, self._is_alive)
-            for link in config.mavlink
-        ]
-        buses = [CanBus(config, bus, Inbox(size, self._wake.set, CAN_ID), self.clock) for bus in config.can]
-        return {f"{kind}.{source.name}": source for kind, made in (("mavlink", links), ("can", buses)) for source in made}
+        return make_inputs(config, Receiver(self.clock, self._wake.set, self._is_alive))
 
     def _is_alive(self) -> bool:
         return self.estimator.is_alive()

@@ -36,7 +36,7 @@ from fusiond.filter.stored_state import StoredState, StoredStateError, check
 from fusiond.messages.csv import csv_header, csv_row
 from fusiond.messages.schedule import Publication
 from fusiond.messages.types import Message, StateMessage
-from fusiond_adapters.logs import LogError
+from fusiond_adapters.logs.file import LogError
 from fusiond_adapters.logs.merge import open_logs
 
 WHOLE = Window()

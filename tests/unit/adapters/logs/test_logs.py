@@ -16,7 +16,7 @@ import pytest
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.events import Received, WheelSpeed
-from fusiond_adapters.logs import LogError, LogInput
+from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.merge import LogSet, open_logs
 from fusiond_adapters.logs.tlog import read_tlog
 from fusiond_adapters.mavlink.decoder import MavlinkDecoder
@@ -434,7 +434,7 @@ def test_consecutive_logs_share_their_sequence_numbers(tmp_path: Path) -> None:
 
 def test_memory_does_not_grow_with_the_log(tlog: Path) -> None:
     tlog.write_bytes(b"".join(records(5)) * 4000)
-    log = LogInput(tlog)
+    log = LogFile(tlog)
     assert log.bytes_total > 1_000_000
     reading = read_tlog(log, MavlinkDecoder(configured(), "fc"))
     next(reading)
