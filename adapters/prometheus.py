@@ -14,6 +14,7 @@ from fusiond.config.toml import ConfigError
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
 from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.units import SECOND
 
 try:
     from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
@@ -86,7 +87,7 @@ class PrometheusServer:
         elif isinstance(message, HealthMessage):
             self._latest.health = message
         elif isinstance(message, InnovationMessage):
-            self._delays.labels(message.source).observe((message.t_receive_ns - message.t_ns) / 1e9)
+            self._delays.labels(message.source).observe((message.t_receive_ns - message.t_ns) / SECOND)
             if message.test_ratio is not None:
                 self._ratios.labels(message.source).observe(message.test_ratio)
 
@@ -119,7 +120,7 @@ class Latest(Collector):  # type: ignore[misc]  # Any, where the extra is missin
 
 
 def _of_state(message: StateMessage) -> Metrics:
-    yield _gauge("time_seconds", "Unix time that the state is valid for", {(): message.t_ns / 1e9})
+    yield _gauge("time_seconds", "Unix time that the state is valid for", {(): message.t_ns / SECOND})
     modes = {(mode.value,): float(mode is message.mode) for mode in Mode}
     yield _gauge("mode", "1 for the present mode", modes, ["mode"])
     if message.age_ms is not None:

@@ -17,6 +17,7 @@ from fusiond.config.schema import Config
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import Inbox, LiveInput, Receiver
+from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.can.kernel_socket import CanFrame
 
 if TYPE_CHECKING:
@@ -109,8 +110,8 @@ class CanBus:
         number = item.arbitration_id | (ERROR_FLAG if item.is_error else 0)
         wide = item.is_extended or item.is_error
         marks = "#R" if item.is_remote else "#" if item.fd_flags is None else f"##{item.fd_flags:X}"
-        seconds, rest = divmod(t_ns, 10**9)
-        stamp = f"({seconds}.{rest // 1000:06d})"
+        seconds, rest = divmod(t_ns, SECOND)
+        stamp = f"({seconds}.{rest // MICROSECOND:06d})"
         return f"{stamp} {self._channel} {number:0{8 if wide else 3}X}{marks}{item.data.hex().upper()}\n".encode()
 
     def counts(self) -> dict[str, int]:

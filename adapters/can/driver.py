@@ -19,6 +19,7 @@ import can
 from fusiond.config.schema import Can
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputLost
+from fusiond.units import nanoseconds
 from fusiond_adapters.can.decoder import EXTENDED, PDU2, CanDecoder
 from fusiond_adapters.can.kernel_socket import CanFrame, CanSocket
 
@@ -56,7 +57,7 @@ class CanDriver:
         while not stop.is_set():
             message = bus.recv(POLL_S)
             if message is not None:
-                self._inbox.put(self._clock.from_wall_ns(round(message.timestamp * 1e9)), _frame(message))
+                self._inbox.put(self._clock.from_wall_ns(nanoseconds(message.timestamp)), _frame(message))
 
     def _read_socket(self, reader: CanSocket, stop: Event) -> None:
         before = self._inbox.missed

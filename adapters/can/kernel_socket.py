@@ -12,6 +12,8 @@ import struct
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from fusiond.units import SECOND
+
 SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40  # asm-generic/socket.h; also the types of their control messages
 HEADER = struct.Struct("=IBB2x")  # of struct can_frame and canfd_frame: id and flags, length, FD flags
 CLASSIC_SIZE, FD_SIZE = 16, 72  # bytes of the structs
@@ -54,7 +56,7 @@ def told_by(control: Control) -> tuple[int | None, int | None]:
     for level, kind, data in control:
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= TIMESPEC.size:
             seconds, nanoseconds = TIMESPEC.unpack_from(data)
-            stamp = seconds * 10**9 + nanoseconds
+            stamp = seconds * SECOND + nanoseconds
         elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL and len(data) >= COUNTER.size:
             (dropped,) = COUNTER.unpack_from(data)
     return stamp, dropped

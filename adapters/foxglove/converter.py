@@ -30,8 +30,8 @@ from fusiond.messages.types import (
     StateAtInstant,
     StateMessage,
 )
+from fusiond.units import SECOND
 
-SECOND = 1_000_000_000  # ns
 ROOT, BODY = "local_enu", "base_link"  # frames
 KNOWN = 3  # position_covariance_type
 LEVELS: dict[Severity, int] = {"info": 2, "notice": 2, "warning": 3, "critical": 4}  # of foxglove.Log

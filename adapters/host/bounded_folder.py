@@ -7,7 +7,7 @@ from collections.abc import Set
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fusiond.units import SECOND
+from fusiond.units import MICROSECOND, SECOND
 
 MEGABYTE = 1_000_000
 FLUSH_S = 1.0  # a crash loses at most this much
@@ -16,7 +16,7 @@ FLUSH_S = 1.0  # a crash loses at most this much
 def file_name(t_ns: int, kind: str) -> str:
     """The name of a file whose first record is of that instant; `kind` is what follows the instant."""
     instant = datetime.fromtimestamp(t_ns // SECOND, UTC)
-    return f"{instant:%Y%m%dT%H%M%S}.{t_ns % SECOND // 1000:06d}Z-{kind}"
+    return f"{instant:%Y%m%dT%H%M%S}.{t_ns % SECOND // MICROSECOND:06d}Z-{kind}"
 
 
 def name_pattern(kind: str) -> re.Pattern[str]:

@@ -6,6 +6,8 @@ import os
 import socket
 import time
 
+from fusiond.units import MICROSECOND
+
 
 class Notifier:
     """The service manager's ear: $NOTIFY_SOCKET, by default that of the environment."""
@@ -29,7 +31,7 @@ class Notifier:
 
     def reloading(self) -> None:
         """A reload has begun; `ready` ends it."""
-        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // MICROSECOND}")
 
     def stopping(self) -> None:
         """A clean end has begun."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import can
 
+from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs.file import LogFile
 from fusiond_adapters.mavlink.decoder import frame_length
@@ -56,14 +57,14 @@ def mavlink_records(path: Path) -> Iterator[tuple[int, bytes]]:
         (stamp_us,) = STAMP.unpack_from(data, at)
         begin = at + STAMP_SIZE
         at = begin + (frame_length(data, begin) or len(data))
-        yield 1000 * stamp_us, data[begin:at]
+        yield stamp_us * MICROSECOND, data[begin:at]
 
 
 def can_records(path: Path) -> Iterator[tuple[int, can.Message]]:
     """Stamp [ns] and frame of each record of a CAN log that python-can reads."""
     with can.LogReader(path) as reader:
         for message in reader:
-            yield round(message.timestamp * 1e6) * 1000, message
+            yield round(message.timestamp * 1e6) * MICROSECOND, message
 
 
 class Player:
@@ -88,11 +89,11 @@ class Player:
         began = time.monotonic()
         for t_ns, send, item in self._records:
             if isinstance(clock, PlayedClock):
-                _sleep(began + (t_ns - self.begin_ns) / clock.speed / 1e9 - time.monotonic())
+                _sleep(began + (t_ns - self.begin_ns) / clock.speed / SECOND - time.monotonic())
                 _await(lambda t_ns=t_ns: not 0 < heard_ns() < t_ns - BEHIND_NS)  # type: ignore[misc]
                 clock.set(t_ns)
             else:
-                _sleep((t_ns - clock.now_ns()) / 1e9)
+                _sleep((t_ns - clock.now_ns()) / SECOND)
             if halt.is_set():
                 return
             self.late_ns = max(self.late_ns, clock.now_ns() - t_ns)

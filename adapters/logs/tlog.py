@@ -15,6 +15,7 @@ from collections.abc import Generator, Iterator
 from struct import Struct
 
 from fusiond.events import Received
+from fusiond.units import MICROSECOND
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.decoder import (
@@ -103,7 +104,7 @@ class _Records:
             counts["records"] += 1
             stamp_us: int = STAMP.unpack_from(self._buffer, at)[0]
             if self._stamp_is_good(stamp_us, at + size):
-                yield self._decoder.decode(self._buffer[at + STAMP_SIZE : at + size], stamp_us * 1000)
+                yield self._decoder.decode(self._buffer[at + STAMP_SIZE : at + size], stamp_us * MICROSECOND)
             at += size
         if cut:
             counts["truncated tail"] += 1
@@ -125,7 +126,7 @@ class _Records:
             last_us = stamp_us
             records += 1
             number, frame = low | middle << 8 | high << 16, buffer[at + STAMP_SIZE : end]
-            events = take(number, counter, system, component, frame, stamp_us * 1000)
+            events = take(number, counter, system, component, frame, stamp_us * MICROSECOND)
             at = end
             if events:
                 yield events

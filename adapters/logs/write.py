@@ -199,7 +199,7 @@ def write_truth(truth: Truth, rate_hz: float, path: Path) -> None:
     interval_ns = int(np.diff(truth.t_ns[:2]).sum()) or 1
     every = max(1, round(1e9 / rate_hz / interval_ns))
     angles = np.degrees(np.column_stack([truth.latitude, truth.longitude, truth.euler]))[::every]
-    columns = (truth.t_ns // 1000, truth.height, truth.velocity_n)
+    columns = (truth.t_ns // MICROSECOND, truth.height, truth.velocity_n)
     stamps, heights, velocities = (column[::every].tolist() for column in columns)
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(TRUTH_COLUMNS + "\n")

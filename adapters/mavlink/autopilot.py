@@ -20,6 +20,7 @@ from fusiond.config.schema import Autopilot, Config
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import State, StateMessage
 from fusiond.ports.outputs import POLL_S, Outbox
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.answers import Parameter
 from fusiond_adapters.mavlink.decoder import message_id
 from fusiond_adapters.mavlink.link import MavlinkLink
@@ -34,7 +35,6 @@ from fusiond_adapters.mavlink.outgoing import (
     vision_position,
 )
 
-SECOND = 1_000_000_000  # ns
 OUTBOX = 64  # messages
 LEAST_HZ = 4.0  # ArduPilot takes a source for dead below that
 STALE_NS = SECOND  # a state that waited for longer is not sent

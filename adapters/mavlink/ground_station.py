@@ -23,6 +23,7 @@ from fusiond.events import GnssPosition, GnssVelocity, Payload, Pressure, WheelS
 from fusiond.messages.types import EventMessage, HealthMessage, Message, Severity, State, StateMessage
 from fusiond.ports.inputs import LiveInput
 from fusiond.ports.outputs import Outbox, OutputLost
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.answers import HANDLED, Parameter, Responder
 from fusiond_adapters.mavlink.decoder import NO_AUTOPILOT, Dialect, FrameSplitter, message_id
 from fusiond_adapters.mavlink.link import MavlinkLink, link_of
@@ -39,7 +40,6 @@ from fusiond_adapters.mavlink.outgoing import (
 )
 from fusiond_adapters.mavlink.transport import Transport, opener
 
-SECOND = 1_000_000_000  # ns
 OUTBOX = 256  # messages
 POLL_S = 0.05  # between two looks for what the ground station says
 HEARTBEAT_NS = SECOND

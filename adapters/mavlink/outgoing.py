@@ -28,6 +28,7 @@ from fusiond.estimator.solution import Mode
 from fusiond.maths.rotation import matrix
 from fusiond.maths.wgs84 import normal_gravity, radii
 from fusiond.messages.types import Block, State, StateMessage
+from fusiond.units import MICROSECOND, MILLISECOND
 
 Array = NDArray[np.float64]
 
@@ -118,7 +119,7 @@ def odometry(message: StateMessage, state: State, origin: Origin, form: Form, qu
     twist = mat_nb.T @ _square(state.covariance_velocity_m2ps2) @ mat_nb
     rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # all that is known of them
     return common.MAVLink_odometry_message(
-        message.t_ns // 1000, form.local_frame, common.MAV_FRAME_BODY_FRD,
+        message.t_ns // MICROSECOND, form.local_frame, common.MAV_FRAME_BODY_FRD,
         *local_position(state, origin, form.on), list(state.quaternion_nb),
         *(mat_nb.T @ state.velocity_ned_mps).tolist(), *state.angular_rate_b_rps,
         _upper(_square(state.covariance_position_m2), _euler_covariance(state)), _upper(twist, rates),
@@ -129,17 +130,18 @@ def vision_position(message: StateMessage, state: State, origin: Origin, form: F
     """VISION_POSITION_ESTIMATE."""
     covariance = _upper(_square(state.covariance_position_m2), _euler_covariance(state))
     return common.MAVLink_vision_position_estimate_message(
-        message.t_ns // 1000, *local_position(state, origin, form.on), *_euler(state), covariance, message.resets & 0xFF
+        message.t_ns // MICROSECOND, *local_position(state, origin, form.on), *_euler(state), covariance,
+        message.resets & 0xFF,
     )
 
 
 def gps_input(message: StateMessage, state: State, geoid_m: float, gps_id: int) -> Any:
     """GPS_INPUT, as of a receiver with two antennas. Its dilutions of precision are the sigmas of position, at 1 m each."""
-    week, week_ms = divmod(message.t_ns // 10**6 + (LEAP_SECONDS - GPS_EPOCH_S) * 1000, WEEK_MS)
+    week, week_ms = divmod(message.t_ns // MILLISECOND + (LEAP_SECONDS - GPS_EPOCH_S) * 1000, WEEK_MS)
     north, east, down = state.sigma_position_ned_m
     horizontal = max(north, east)
     return common.MAVLink_gps_input_message(
-        message.t_ns // 1000, gps_id, 0, week_ms, week, 3,
+        message.t_ns // MICROSECOND, gps_id, 0, week_ms, week, 3,
         _e7(state.lat_deg), _e7(state.lon_deg), state.height_m - geoid_m, horizontal, down,
         *state.velocity_ned_mps, state.sigma_velocity_mps, horizontal, down, ASSUMED_SATELLITES,
         round(state.yaw_deg % 360 * 100) or NORTH_CDEG)  # fmt: skip
@@ -149,7 +151,7 @@ def set_origin(message: StateMessage, origin: Origin, geoid_m: float, system: in
     """SET_GPS_GLOBAL_ORIGIN."""
     height_mm = round((origin.height_m - geoid_m) * 1e3)
     return common.MAVLink_set_gps_global_origin_message(
-        system, _e7(origin.latitude_deg), _e7(origin.longitude_deg), height_mm, message.t_ns // 1000
+        system, _e7(origin.latitude_deg), _e7(origin.longitude_deg), height_mm, message.t_ns // MICROSECOND
     )
 
 
@@ -163,7 +165,7 @@ def global_position(message: StateMessage, state: State, origin: Origin, geoid_m
     covariance[:3, :3] = up @ _square(state.covariance_position_m2) @ up
     covariance[3:, 3:] = _square(state.covariance_velocity_m2ps2)
     return common.MAVLink_global_position_int_cov_message(
-        message.t_ns // 1000, common.MAV_ESTIMATOR_TYPE_GPS_INS, _e7(state.lat_deg), _e7(state.lon_deg),
+        message.t_ns // MICROSECOND, common.MAV_ESTIMATOR_TYPE_GPS_INS, _e7(state.lat_deg), _e7(state.lon_deg),
         round((state.height_m - geoid_m) * 1e3), round((state.height_m - origin.height_m) * 1e3),
         *state.velocity_ned_mps, covariance.ravel().tolist())  # fmt: skip
 
@@ -176,14 +178,15 @@ def local_position_ned(message: StateMessage, state: State, origin: Origin) -> A
     bias = mat_nb @ np.diag(np.square(state.sigma_accel_bias_mps2)) @ mat_nb.T
     blocks = (_square(state.covariance_position_m2), _square(state.covariance_velocity_m2ps2), bias)
     return common.MAVLink_local_position_ned_cov_message(
-        message.t_ns // 1000, common.MAV_ESTIMATOR_TYPE_GPS_INS, *local_position(state, origin, ellipsoid_map),
+        message.t_ns // MICROSECOND, common.MAV_ESTIMATOR_TYPE_GPS_INS, *local_position(state, origin, ellipsoid_map),
         *state.velocity_ned_mps, *acceleration_n.tolist(), _upper(*blocks))  # fmt: skip
 
 
 def attitude_quaternion(message: StateMessage, state: State) -> Any:
     """ATTITUDE_QUATERNION_COV."""
     return common.MAVLink_attitude_quaternion_cov_message(
-        message.t_ns // 1000, list(state.quaternion_nb), *state.angular_rate_b_rps, _euler_covariance(state).ravel().tolist()
+        message.t_ns // MICROSECOND, list(state.quaternion_nb), *state.angular_rate_b_rps,
+        _euler_covariance(state).ravel().tolist(),
     )
 
 
@@ -207,7 +210,7 @@ def estimator_status(message: StateMessage, ratios: Ratios) -> Any:
         if message.mode is not Mode.LOST:
             flags |= common.ESTIMATOR_POS_HORIZ_ABS | common.ESTIMATOR_POS_VERT_ABS | common.ESTIMATOR_PRED_POS_HORIZ_ABS
     return common.MAVLink_estimator_status_message(
-        message.t_ns // 1000, flags, *ratios, math.nan, math.nan, math.nan, horizontal, vertical
+        message.t_ns // MICROSECOND, flags, *ratios, math.nan, math.nan, math.nan, horizontal, vertical
     )
 
 
@@ -216,7 +219,7 @@ def marker(message: StateMessage, state: State, origin: Origin, geoid_m: float) 
     autopilot's."""
     velocity = [round(component * 100) for component in state.velocity_ned_mps]
     return common.MAVLink_global_position_int_message(
-        message.t_ns // 10**6 & 0xFFFFFFFF, _e7(state.lat_deg), _e7(state.lon_deg),
+        message.t_ns // MILLISECOND & 0xFFFFFFFF, _e7(state.lat_deg), _e7(state.lon_deg),
         round((state.height_m - geoid_m) * 1e3), round((state.height_m - origin.height_m) * 1e3),
         *velocity, round(state.yaw_deg % 360 * 100) % NORTH_CDEG)  # fmt: skip
 

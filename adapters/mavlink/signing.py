@@ -15,13 +15,14 @@ from typing import Any
 
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.decoder import CHECKSUM, HEADER_2, MAGIC_2, SIGNED
 
 KEY_SIZE = 32  # bytes
 SIGNATURE_SIZE, DIGEST_SIZE = 13, 6  # bytes: link, timestamp (6), digest (6)
-EPOCH_NS = 1_420_070_400 * 10**9  # 2015
+EPOCH_NS = 1_420_070_400 * SECOND  # 2015
 TICK_NS = 10_000
-MINUTE = 60 * 10**9 // TICK_NS  # in timestamps
+MINUTE = 60 * SECOND // TICK_NS  # in timestamps
 LONGEST_FILE = 100  # characters of a timestamp file
 
 

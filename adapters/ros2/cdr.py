@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from fusiond.messages.local_frame import LocalState, Placed
 from fusiond.messages.types import Block, Quaternion, Triple
+from fusiond.units import SECOND
 
-SECOND = 1_000_000_000  # ns
 ODOMETRY = "nav_msgs/msg/Odometry"
 FIX = "sensor_msgs/msg/NavSatFix"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"

@@ -9,10 +9,10 @@ from fusiond.config.schema import Ros2
 from fusiond.estimator.solution import Mode
 from fusiond.messages.local_frame import LocalFrame, OdometryFrame
 from fusiond.messages.types import HealthMessage, InputHealth, OutputHealth, SourceHealth, State, StateMessage
+from fusiond.units import SECOND
 from fusiond_adapters.ros2 import cdr
 from fusiond_adapters.ros2.cdr import ERROR, OK, WARN, Status
 
-SECOND = 1_000_000_000  # ns
 FIT = (Mode.NOMINAL, Mode.DEAD_RECKONING)
 LEVELS = {Mode.NOMINAL: OK, Mode.DEAD_RECKONING: WARN, Mode.ALIGNING: WARN, Mode.LOST: ERROR}
 RESET_SHOWN_NS = 5 * SECOND  # how long the diagnostics warn of a reset

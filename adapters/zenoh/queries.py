@@ -18,9 +18,8 @@ from fusiond.config.schema import Config
 from fusiond.messages.codec import encode
 from fusiond.messages.keys import key as key_of
 from fusiond.messages.types import Message, StateMessage
+from fusiond.units import SECOND
 from fusiond_adapters.zenoh.session import CONTENT_TYPES, message_key
-
-SECOND = 1_000_000_000  # ns
 
 
 class Answers:

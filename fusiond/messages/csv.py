@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from fusiond.messages.types import State, StateMessage
+from fusiond.units import MICROSECOND
 
 CSV_COLUMNS = (
     "unix_us",
@@ -34,7 +35,7 @@ def csv_header() -> str:
 def csv_row(message: StateMessage) -> str:
     """One line, without its end. Numbers are the shortest that read back as the same float; no state, empty cells."""
     numbers = _csv_numbers(message.state) if message.state else [""] * (len(CSV_COLUMNS) - 2)
-    return ",".join([str(message.t_ns // 1000), *numbers, message.mode.value])
+    return ",".join([str(message.t_ns // MICROSECOND), *numbers, message.mode.value])
 
 
 def _csv_numbers(state: State) -> Iterable[str]:

@@ -18,6 +18,7 @@ from fusiond.messages.types import (
     StateMessage,
     Triple,
 )
+from fusiond.units import MILLISECOND
 
 AnyState = TypeVar("AnyState", bound=StateAtInstant)
 
@@ -42,7 +43,7 @@ def _told(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: Outc
         vehicle=vehicle,
         t_ns=estimate.t_ns,
         mode=Mode.LOST if fault else estimate.mode,
-        age_ms=None if estimate.age_ns is None else estimate.age_ns / 1e6,
+        age_ms=None if estimate.age_ns is None else estimate.age_ns / MILLISECOND,
         resets=estimate.resets,
         fault=fault,
         state=state,

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.messages.types import Quantiles
+from fusiond.units import MILLISECOND
 
 KEPT = 4096  # the latest so many: 10 s of 400 a second
-MILLISECOND = 1e6  # ns
 
 
 class RecentLatencies:

@@ -17,8 +17,9 @@ from typing import NamedTuple
 from fusiond.maths.portable import sin_cos
 from fusiond.maths.wgs84 import EARTH_RATE, ecef
 from fusiond.messages.types import Block, Quaternion, State, Triple
+from fusiond.units import SECOND
 
-GAP_NS = 1_000_000_000  # over a longer pause nothing is known of the way between
+GAP_NS = SECOND  # over a longer pause nothing is known of the way between
 
 
 class Convention(NamedTuple):
@@ -117,7 +118,7 @@ class OdometryFrame:
         """Where the odometry frame is in the local one, and the body in the odometry frame. Stamps ascend."""
         last, self._last = self._last, (t_ns, state)
         if last is not None and 0 < t_ns - last[0] <= GAP_NS:
-            dt = (t_ns - last[0]) / 1e9
+            dt = (t_ns - last[0]) / SECOND
             step = _about_vertical(self._turn, _scaled(_sum(last[1].velocity_l, state.velocity_l), dt / 2))
             self._position_o = _sum(self._position_o, step)
             self._turn -= _correction(last[1], state, dt)
