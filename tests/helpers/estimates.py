@@ -61,3 +61,33 @@ def numbers(published: State) -> list[float]:
     """Every number of a published state."""
     values = msgspec.structs.astuple(published)
     return [number for value in values for number in (value if isinstance(value, tuple) else (value,))]
+
+
+def random_state(seed: int = 3, **given: Any) -> State:
+    """A random state as published, some kilometres from 48.1 N, 11.6 E."""
+    random = np.random.default_rng(seed)
+
+    def triple() -> tuple[float, ...]:
+        return tuple(random.normal(size=3).tolist())
+
+    def covariance() -> tuple[float, ...]:
+        root = random.normal(size=(3, 3))
+        product = root @ root.T
+        return tuple(((product + product.T) / 2).ravel().tolist())
+
+    turned = random.normal(size=4)
+    values: dict[str, Any] = {
+        "lat_deg": 48.1 + 0.1 * random.normal(),
+        "lon_deg": 11.6 + 0.1 * random.normal(),
+        "height_m": 500.0 + random.normal(),
+        "velocity_ned_mps": triple(),
+        "quaternion_nb": tuple((turned / np.linalg.norm(turned)).tolist()),
+        **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg", "wheel_scale", "sigma_wheel_scale"), 0.0),
+        **dict.fromkeys(("sigma_velocity_mps", "sigma_yaw_deg"), 1.0),
+        **{name: covariance() for name in State.__struct_fields__ if name.startswith("covariance")},
+        "mount_deg": (0.0, 0.0),
+        "sigma_mount_deg": (0.0, 0.0),
+        "sigma_gyro_bias_rps": tuple(abs(x) for x in triple()),
+    }
+    rest = [name for name in State.__struct_fields__ if name not in values]
+    return State(**{**values, **{name: triple() for name in rest}, **given})

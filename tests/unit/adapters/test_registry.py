@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -57,3 +59,9 @@ def test_an_unknown_log_is_told_which_are_known(tmp_path: Path) -> None:
     told = str(refused.value)
     assert all(f"{kind.suffix} ({kind.about})" in told for kind in LOG_FORMATS)
     assert told.endswith("all but .db and .mf4 also with .gz")
+
+
+def test_nothing_is_imported_for_what_is_off() -> None:
+    code = "import sys, fusiond_adapters.registry; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"rosbags", "mcap", "foxglove", "prometheus_client", "zenoh", "can", "cantools"} & set(loaded)

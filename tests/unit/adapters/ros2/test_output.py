@@ -20,11 +20,12 @@ from fusiond.maths.rotation import matrix
 from fusiond.messages.local_frame import LocalFrame, LocalState
 from fusiond.messages.types import Message, State, StateMessage
 from fusiond.ports.outputs import OutputLost
+from fusiond.units import SECOND
 from fusiond_adapters.ros2 import wire
 from fusiond_adapters.ros2.convert import Converter
-from fusiond_adapters.ros2.output import Ros2Output, topics
+from fusiond_adapters.ros2.output import Ros2Output, make, topics
 from fusiond_adapters.zenoh.session import open_session
-from tests.unit.adapters.ros2.test_wire import DEADLINE, SECOND, T0, definitions, health, told
+from tests.helpers.ros2 import DEADLINE, T0, definitions, health, told
 
 SUBSCRIBER = """
 import atexit, json, os, queue, sys
@@ -279,3 +280,12 @@ def test_a_router_that_goes_and_comes_back() -> None:
             again.put(told(1))
             assert arrived.wait(DEADLINE)
     assert again.output.counts()["sent"] == 4
+
+
+def test_humble_has_no_hashes() -> None:
+    assert {topic.hash for _, topic in topics(Ros2(type_hashes=False))} == {"TypeHashNotSupported"}
+
+
+def test_it_says_where_it_connects() -> None:
+    (output,) = make(Config(ros2=Ros2(enabled=True)), None)  # type: ignore[arg-type]
+    assert output.name == "ros2" and "tcp/127.0.0.1:7447" in output.about
