@@ -24,7 +24,7 @@ from fusiond.config.schema import Config
 from fusiond.estimator.solution import Estimate, Mode, StateEstimate
 from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.messages.from_solution import state_message
-from fusiond.messages.types import OutcomeCounts, StateMessage
+from fusiond.messages.types import OutcomeCounts, State, StateMessage
 from fusiond.ports.inputs import Inbox
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.mavlink.link import MavlinkLink
@@ -363,3 +363,8 @@ def rotated(q: Any, v: Triple) -> Triple:
     t = 2 * np.cross(u, v)
     x, y, z = (np.array(v) + w * t + np.cross(u, t)).tolist()
     return x, y, z
+
+
+def state_of(state: StateMessage) -> State:
+    assert state.state is not None
+    return state.state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from importlib import import_module
@@ -65,3 +66,13 @@ def test_nothing_is_imported_for_what_is_off() -> None:
     code = "import sys, fusiond_adapters.registry; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not {"rosbags", "mcap", "foxglove", "prometheus_client", "zenoh", "can", "cantools"} & set(loaded)
+
+
+@pytest.mark.parametrize(
+    ("adapter", "library"), [("mcap", "mcap"), ("foxglove.server", "foxglove"), ("prometheus", "prometheus_client")]
+)
+def test_a_missing_extra_is_named(adapter: str, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, library, None)  # as if it were not installed
+    monkeypatch.delitem(sys.modules, f"fusiond_adapters.{adapter}", raising=False)
+    with pytest.raises(ConfigError, match=rf"pip install 'fusiond\[{adapter.removesuffix('.server')}\]'"):
+        importlib.import_module(f"fusiond_adapters.{adapter}")
