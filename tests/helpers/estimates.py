@@ -14,6 +14,19 @@ from fusiond.messages.types import OutcomeCounts, State, StateMessage
 
 T_NS = 1_700_000_000_123_456_789
 COUNTS = OutcomeCounts(fused=7, rejected=1)
+SCALARS = ("latitude", "longitude", "height", "wheel_scale", "sigma_wheel_scale")
+VECTORS = {
+    "velocity_n": 3,
+    "quaternion_nb": 4,
+    "angular_rate_b": 3,
+    "acceleration_b": 3,
+    "gyro_bias": 3,
+    "accel_bias": 3,
+    "mount": 2,
+    "sigma_gyro_bias": 3,
+    "sigma_accel_bias": 3,
+    "sigma_mount": 2,
+}
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
@@ -91,3 +104,21 @@ def random_state(seed: int = 3, **given: Any) -> State:
     }
     rest = [name for name in State.__struct_fields__ if name not in values]
     return State(**{**values, **{name: triple() for name in rest}, **given})
+
+
+def random_messages(count: int) -> list[StateMessage]:
+    """The first is aligning, the rest have random states."""
+    random = np.random.default_rng(11)
+
+    def state() -> StateEstimate:
+        root = random.normal(size=(9, 9))
+        values: dict[str, Any] = {name: random.normal() for name in SCALARS}
+        values |= {name: tuple(random.normal(size=size).tolist()) for name, size in VECTORS.items()}
+        return StateEstimate(covariance=root @ root.T, **values)
+
+    def told(number: int) -> Estimate:
+        t_ns = 1_700_000_000_000_000_001 + number * 20_000_000
+        mode = Mode.NOMINAL if number else Mode.ALIGNING
+        return Estimate(t_ns, mode, 3_000_001, 0, state() if number else None)
+
+    return [state_message(told(number), "rover", OutcomeCounts(fused=number)) for number in range(count)]

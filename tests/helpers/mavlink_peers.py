@@ -29,7 +29,8 @@ from fusiond.ports.inputs import Inbox
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.mavlink.link import MavlinkLink
 from fusiond_adapters.mavlink.talk import MavlinkTalk
-from tests.helpers.live import DEADLINE, configuration
+from tests.helpers.live import configuration
+from tests.helpers.network import DEADLINE
 
 SYSTEM, COMPONENT = 7, 1
 CLOCK = HostClock()

@@ -7,19 +7,11 @@ from typing import Any
 from rosbags.typesys import Stores, get_typestore
 
 from fusiond.estimator.solution import Mode
-from fusiond.messages.types import (
-    HealthMessage,
-    InputHealth,
-    LatencyHealth,
-    OutcomeCounts,
-    SourceHealth,
-    StateMessage,
-)
+from fusiond.messages.types import HealthMessage, InputHealth, LatencyHealth, OutcomeCounts, SourceHealth, StateMessage
 from fusiond.units import SECOND
 from tests.helpers.estimates import random_state
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-DEADLINE = 15.0  # s
 T0 = 1_700_000_000 * SECOND
 
 

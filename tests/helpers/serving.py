@@ -8,8 +8,7 @@ from threading import Event, Thread
 from typing import Any
 
 from fusiond.ports.outputs import OutputLost
-
-DEADLINE = 15.0  # s
+from tests.helpers.network import DEADLINE
 
 
 @contextmanager

@@ -23,9 +23,9 @@ from fusiond.messages.codec import decode
 from fusiond.messages.csv import csv_row
 from fusiond.messages.types import EventMessage, HealthMessage, InnovationMessage, Message, StateMessage
 from tests.helpers.drive import LOGS, folder, messages, settings
-from tests.helpers.live import Autopilot, configuration, running
-from tests.unit.app.live.test_daemon import aligned, free_port, udp
-from tests.unit.app.live.test_daemon import drive as steer
+from tests.helpers.live import Autopilot, aligned, configuration, running
+from tests.helpers.live import drive as steer
+from tests.helpers.network import free_port, udp
 
 pytest.importorskip("mcap", reason="the extra mcap is not installed")
 

@@ -22,7 +22,8 @@ from fusiond.messages.types import (
 )
 from fusiond.units import SECOND
 from tests.helpers.drive import messages, settings
-from tests.helpers.serving import DEADLINE, serving
+from tests.helpers.network import DEADLINE
+from tests.helpers.serving import serving
 
 pytest.importorskip("prometheus_client", reason="the extra prometheus is not installed")
 

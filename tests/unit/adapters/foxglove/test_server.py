@@ -20,7 +20,8 @@ from fusiond.units import SECOND
 from fusiond_adapters.foxglove.converter import LOG, POSE, TOPICS, channels
 from tests.helpers.drive import messages, settings
 from tests.helpers.foxglove import states
-from tests.helpers.serving import DEADLINE, serving
+from tests.helpers.network import DEADLINE
+from tests.helpers.serving import serving
 
 
 def server_of(port: int = 0) -> Any:

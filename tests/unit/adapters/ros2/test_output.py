@@ -25,7 +25,8 @@ from fusiond_adapters.ros2 import wire
 from fusiond_adapters.ros2.convert import Converter
 from fusiond_adapters.ros2.output import Ros2Output, make, topics
 from fusiond_adapters.zenoh.session import open_session
-from tests.helpers.ros2 import DEADLINE, T0, definitions, health, told
+from tests.helpers.network import DEADLINE, free_port
+from tests.helpers.ros2 import T0, definitions, health, told
 
 SUBSCRIBER = """
 import atexit, json, os, queue, sys
@@ -69,12 +70,6 @@ for topic, *_ in asked:
     seen = get_topic_info(topic, 42, router_port=port, verbose=True).publishers
     print(json.dumps([[p.node_name, p.node_namespace, p.topic_type, p.type_hash, p.qos] for p in seen]), flush=True)
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def router(port: int) -> zenoh.Session:
@@ -134,7 +129,7 @@ def subscriber(port: int, asked: list[Any]) -> Iterator[Iterator[Any]]:
 
 def test_the_sdk_receives_every_number_in_another_process() -> None:
     pytest.importorskip("zenoh_ros2_sdk", reason="needs zenoh-ros2-sdk")
-    port, name_of = free_port(), {}
+    port, name_of = free_port(socket.SOCK_STREAM), {}
     asked = []
     for name, topic in topics(Ros2(namespace="/rover")):
         name_of[topic.name] = name
@@ -240,7 +235,7 @@ def check_wire(raw: list[Any], want: dict[str, list[bytes]], seen: dict[str, Any
 
 def test_the_gid_is_the_hash_of_the_token() -> None:
     """rmw_zenoh finds the publisher of a message by it."""
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     tokens: list[str] = []
     complete = Event()
 
@@ -263,7 +258,7 @@ def test_the_gid_is_the_hash_of_the_token() -> None:
 
 
 def test_a_router_that_goes_and_comes_back() -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     first = router(port)
     running = Running(port)
     with running:
