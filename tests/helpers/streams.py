@@ -24,7 +24,14 @@ T0 = 1_700_000_000 * SECOND
 MUNICH = (math.radians(48.1), math.radians(11.6), 520.0)  # rad, rad, m
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
+PULLS_AWAY_S = 3.0  # when the drives that depart do so
 Curve = Callable[[Array], Array]
+
+
+def ramp(t: Array, begin: float, length: float) -> Array:
+    """From 0 to 1 in `length` seconds, smoothly."""
+    u = np.clip((t - begin) / length, 0.0, 1.0)
+    return u * u * (3 - 2 * u)
 
 
 def config(wheels: Iterable[str] = WHEELS, **tables: dict[str, Any]) -> Config:

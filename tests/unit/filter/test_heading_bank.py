@@ -13,16 +13,9 @@ from fusiond.events import GnssVelocity, Measurement
 from fusiond.filter.heading_bank import alive, difference, normalise
 from fusiond.filter.measurement_update import inject
 from fusiond.filter.state import ATTITUDE, CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
-from fusiond.maths.wgs84 import Array, mat_ne
+from fusiond.maths.wgs84 import mat_ne
 from tests.conftest import needs_compiled
-from tests.helpers.streams import SECOND, T0, Drive, config, drive, fuse, measurements, running_state
-
-PULLS_AWAY_S = 3.0
-
-
-def ramp(t: Array, begin: float, length: float) -> Array:
-    u = np.clip((t - begin) / length, 0.0, 1.0)
-    return u * u * (3 - 2 * u)
+from tests.helpers.streams import PULLS_AWAY_S, SECOND, T0, Drive, config, drive, fuse, measurements, ramp, running_state
 
 
 def departing(heading: float, speed: float = 6.0, seconds: float = 13.0) -> Drive:

@@ -29,8 +29,7 @@ from fusiond.filter.state import (
 from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, installation, to_text
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
 from tests.conftest import needs_compiled
-from tests.helpers.streams import SECOND, T0, Drive, config, drive, fuse, measurements
-from tests.unit.filter.test_heading_bank import PULLS_AWAY_S, ramp
+from tests.helpers.streams import PULLS_AWAY_S, SECOND, T0, Drive, config, drive, fuse, measurements, ramp
 
 HOUR = 3600 * SECOND
 YAW = 0.7
