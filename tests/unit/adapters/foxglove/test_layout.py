@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fusiond_adapters.foxglove import layout as foxglove_layout
-from fusiond_adapters.foxglove.converter import channels, innovations_topic
+from fusiond_adapters.foxglove.converter import channels
 from tests.helpers.foxglove import PLAIN, fields
 from tests.helpers.paths import ROOT
 
@@ -42,7 +42,7 @@ def test_the_documented_layout_fits_the_demo_and_its_paths_exist() -> None:
         named = [panel[key] for key in ("followTopic", "topicToRender", "topicPath") if key in panel]
         assert all(topic in schemas for topic in [*named, *panel.get("topics", {})])
     ratios = {path["value"] for path in layout["configById"]["Plot!ratios"]["paths"]}
-    assert ratios == {f"{innovations_topic(source)}.test_ratio" for source in car.sources() if source != "imu0"}
+    assert ratios == {f"/fusiond/innovations/{source.replace('.', '/')}.test_ratio" for source in car.sources() if source != "imu0"}
 
 
 def test_the_layout_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

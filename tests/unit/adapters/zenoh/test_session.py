@@ -14,10 +14,8 @@ from fusiond.config.schema import Encoding, Zenoh
 from fusiond.messages.codec import encode
 from fusiond.messages.csv import csv_row
 from fusiond_adapters.zenoh.session import (
-    CONTENT_TYPES,
     PublishError,
     ZenohPublisher,
-    alive_key,
     open_session,
     session_config,
     state_key,
@@ -75,14 +73,14 @@ def test_another_process_gets_every_bit(encoding: Encoding) -> None:
         ZenohPublisher(session, "rover", encoding) as publisher,
         python(SUBSCRIBER, port, MESSAGES) as reader,
     ):
-        assert json.loads(read_line(reader)) == [alive_key("rover")]
+        assert json.loads(read_line(reader)) == ["fusiond/rover/@alive/state"]
         wait_for_reader(publisher)
         for message in random_messages(MESSAGES):
             publisher.publish(message)
             key, content_type, priority, express, payload, row = json.loads(read_line(reader))
             assert bytes.fromhex(payload) == encode(message, encoding)
             assert row == csv_row(message)
-            assert (key, content_type) == (state_key("rover"), CONTENT_TYPES[encoding])
+            assert (key, content_type) == ("fusiond/rover/state", f"application/{encoding}")
             assert (priority, express) == (str(zenoh.Priority.REAL_TIME), True)
         assert reader.wait(DEADLINE) == 0
 
