@@ -48,6 +48,11 @@ def test_tables_of_keys_are_up_to_date(name: str) -> None:
     assert load("make_configuration").page(name, text) == text, "run: python docs/make_configuration.py"
 
 
+def test_the_architecture_is_up_to_date() -> None:
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    assert load("make_architecture").page(text) == text, "run: python docs/make_architecture.py"
+
+
 def test_every_key_is_in_the_tables() -> None:
     text = (DOCS / "configuration.md").read_text(encoding="utf-8")
     for section in (sections.Filter, sections.Motion, sections.Gnss, sections.Wheel, sections.Record):

@@ -42,7 +42,8 @@ def test_the_documented_layout_fits_the_demo_and_its_paths_exist() -> None:
         named = [panel[key] for key in ("followTopic", "topicToRender", "topicPath") if key in panel]
         assert all(topic in schemas for topic in [*named, *panel.get("topics", {})])
     ratios = {path["value"] for path in layout["configById"]["Plot!ratios"]["paths"]}
-    assert ratios == {f"/fusiond/innovations/{source.replace('.', '/')}.test_ratio" for source in car.sources() if source != "imu0"}
+    sources = [source.replace(".", "/") for source in car.sources() if source != "imu0"]
+    assert ratios == {f"/fusiond/innovations/{source}.test_ratio" for source in sources}
 
 
 def test_the_layout_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
