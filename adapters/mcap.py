@@ -2,7 +2,7 @@
 
     python -m fusiond_adapters.mcap CUT.mcap WHOLE.mcap
 
-writes what is whole of a file that was cut off (power, full disk) into a file with an index. Needs the extra `mcap`.
+copies the intact part of a file that was cut off (power, full disk) into a file with an index. Needs the extra `mcap`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("MCAP files need the extra mcap: pip install 'fusiond[mcap]'") from missing
 
-CHUNK_BYTES = 1 << 20  # a chunk ends here at the latest
+CHUNK_BYTES = 1 << 20  # largest chunk
 LIBRARY = f"fusiond {__version__}"
 KIND = "fusion.mcap"
 NAME = name_pattern(re.escape(KIND))  # nothing else in the folder is ever removed
@@ -65,7 +65,7 @@ class McapFile:
         return self._out.written
 
     def add(self, record: Record) -> None:
-        """Write a record, behind those before it."""
+        """Append a record."""
         second = record.publish_ns // SECOND
         if second != self._second:
             self.flush()
@@ -88,7 +88,8 @@ class McapFile:
             self._out.close()
 
     def abandon(self) -> None:
-        """After an OSError: leave what was written whole, or no file. The index is missing, see `repair`. Raises OSError."""
+        """After an OSError: keep the complete chunks, or remove an empty file. The index is missing, see `repair`. Raises
+        OSError."""
         self._out.cut()
         if not self.size:
             self._path.unlink(missing_ok=True)
@@ -111,7 +112,7 @@ class McapFile:
 
 
 class _Out:
-    """Gathers what the writer writes, and hands it to the file whole, so that a full disk leaves no half of it behind."""
+    """Collects the writer's bytes and writes them in whole chunks, so that a full disk leaves no part of one behind."""
 
     def __init__(self, path: Path) -> None:
         self.written = 0
@@ -161,7 +162,7 @@ def _registered(writer: Writer, channel: Channel) -> int:
 
 
 class McapRecorder:
-    """The live output: files of bounded size in a folder, the oldest of which go in time."""
+    """The live output: files of bounded size in a folder, of which the oldest are removed."""
 
     name = "mcap"
 
@@ -178,7 +179,7 @@ class McapRecorder:
         self._chunk = 0  # largest so far [bytes]
 
     def session(self, stop: Event) -> None:
-        """Write until told to stop. Raises OutputLost."""
+        """Write until `stop` is set. Raises OutputLost."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._run(stop)
@@ -245,8 +246,8 @@ def make(config: Config, _: Around) -> Sequence[LiveOutput]:
 
 
 def repair(cut: Path, whole: Path) -> tuple[int, str | None]:
-    """Write what is whole of a file into another: the number of messages, and what ended the reading, if it was not the
-    end of the messages. Raises OSError."""
+    """Copy the intact part of a file into another. Returns the number of messages, and why reading stopped early, if it did.
+    Raises OSError."""
     messages, ids, reason = 0, dict[int, int](), None
     with cut.open("rb") as source, whole.open("wb") as target:
         writer = Writer(target, chunk_size=CHUNK_BYTES)

@@ -23,7 +23,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[prometheus] needs the extra prometheus: pip install 'fusiond[prometheus]'") from missing
 
-MOST_WAITING = 4096  # messages between the estimator and the counting
+MAX_WAITING = 4096  # messages between the estimator and the counting
 RATIO_BUCKETS = (0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 2.0, 5.0, 10.0, 100.0)
 DELAY_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s
 QUANTILES = {"p50": "0.5", "p90": "0.9", "p99": "0.99", "max": "1"}
@@ -32,14 +32,14 @@ Metrics = Iterator[Any]
 
 
 class PrometheusServer:
-    """The live output. What a scrape tells is as of the latest messages."""
+    """The live output. A scrape shows the latest messages."""
 
     name = "prometheus"
 
     def __init__(self, config: Config) -> None:
         self._section = config.prometheus
         self.about = f"Prometheus metrics on {self._section.host}:{self._section.port}"
-        self.outbox = Outbox(MOST_WAITING, (StateMessage, HealthMessage, InnovationMessage))
+        self.outbox = Outbox(MAX_WAITING, (StateMessage, HealthMessage, InnovationMessage))
         self.url: str | None = None  # while it runs
         self._registry = CollectorRegistry()
         self._latest = Latest()
@@ -55,7 +55,7 @@ class PrometheusServer:
         )  # fmt: skip
 
     def session(self, stop: Event) -> None:
-        """Serve until told to stop. Raises OutputLost."""
+        """Serve until `stop` is set. Raises OutputLost."""
         try:
             server, thread = start_http_server(self._section.port, self._section.host, registry=self._registry)
         except OSError as error:

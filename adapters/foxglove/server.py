@@ -1,6 +1,6 @@
 """Foxglove live: a WebSocket server with the topics of the MCAP files. Needs the extra `foxglove`.
 
-The server is the SDK's own, in threads outside Python; to a client that is slow it drops the oldest messages.
+The SDK's own server runs in threads outside Python. For a slow client it drops the oldest messages.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[foxglove] needs the extra foxglove: pip install 'fusiond[foxglove]'") from missing
 
-MOST_WAITING = 1024  # messages between the estimator and the server, and as many again to each client
+MAX_WAITING = 1024  # messages between the estimator and the server, and as many again to each client
 
 
 class FoxgloveServer:
@@ -28,14 +28,14 @@ class FoxgloveServer:
 
     def __init__(self, config: Config) -> None:
         self.about = f"Foxglove server on {config.foxglove.host}:{config.foxglove.port}"
-        self.outbox = Outbox(MOST_WAITING, SHOWN)
+        self.outbox = Outbox(MAX_WAITING, SHOWN)
         self.shown = 0  # records given to the server
         self.url: str | None = None  # while it runs
         self._config = config
         self._converter = Converter(config.foxglove.rate_hz)
 
     def session(self, stop: Event) -> None:
-        """Serve until told to stop. Raises OutputLost."""
+        """Serve until `stop` is set. Raises OutputLost."""
         section, context = self._config.foxglove, Context()
         try:
             server = start_server(
@@ -43,7 +43,7 @@ class FoxgloveServer:
                 host=section.host,
                 port=section.port,
                 context=context,
-                message_backlog_size=MOST_WAITING,
+                message_backlog_size=MAX_WAITING,
             )
         except RuntimeError as error:  # all that the SDK raises
             raise OutputLost(f"{self.about}: {error}") from error

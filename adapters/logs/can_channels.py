@@ -25,7 +25,7 @@ from fusiond_adapters.logs.format import Opening, Reading
 
 ID_BITS = 0x1FFFFFFF  # in the 8-digit ids of candump
 STEP_NS = SECOND  # a stamp that jumps by more is compared with the next one
-DECISION = 100  # wheel frames that the choice of channels looks at
+DECISION = 100  # wheel frames from which the channels are chosen
 
 
 class LogFrame(NamedTuple):
@@ -96,8 +96,8 @@ def _events(opening: Opening, read: FrameReader, decoders: Mapping[str, CanDecod
 
 
 def _without_strays(frames: Iterator[LogFrame], log: LogFile) -> Iterator[LogFrame]:
-    """The frames but those whose stamp jumps away from the one before while the next is back: a damaged digit, which would
-    hold up everything after it. A stamp that others follow is a clock that was set."""
+    """The frames without those whose stamp alone jumps away and back: a damaged digit, which would delay everything after
+    it. Where the next stamps follow a jump, the clock was set."""
     last_ns: int | None = None
     held: LogFrame | None = None
     for frame in frames:

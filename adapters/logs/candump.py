@@ -18,7 +18,7 @@ LINE = re.compile(
 OTHERS = (  # lines as candump itself writes them, of data frames whose ids are not among those at %(ids)b
     rb"((?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%(ids)b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*+\n)*+)"
 )
-WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*+)\n)?+"  # the like, of an id that is
+WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*+)\n)?+"  # such a line with an id that is among them
 LONGEST_LINE = 1 << 16  # bytes; more without a line's end is no text
 ERROR_FLAG = 0x20000000  # in the 8-digit ids of candump
 
@@ -29,8 +29,8 @@ def open_log(opening: Opening) -> Reading:
 
 
 def _candump(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
-    """The frames of a `candump -L` log whose ids are wanted. Most lines of a log are of other ids: stretches of them are
-    passed over in one step."""
+    """The frames of a `candump -L` log whose ids are wanted. Most lines have other ids; one step
+    skips a stretch of them."""
     ids = b"|".join(wanted.patterns()) or b"-"  # no id begins with a dash
     scan = re.compile((OTHERS + WANTED) % {b"ids": ids}).match
     counts = log.counts

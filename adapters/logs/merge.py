@@ -23,7 +23,7 @@ Item = TypeVar("Item")
 
 
 def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
-    """Make ready to read the logs of one drive. Nothing but their size is looked at yet.
+    """Prepare the logs of one drive for reading. Only their sizes are read yet.
 
     The suffix of a path gives the format. A .tlog belongs to the first [mavlink.NAME]; a CAN log may hold any [can.NAME],
     told apart by channel (see `can_channels`). `LINK=path` or `BUS=path` says which it is.
@@ -38,8 +38,8 @@ def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
 class LogSet:
     """The logs of one drive; iterating, once, yields their events merged by `t_receive_ns`.
 
-    Each log keeps its own order. Where its stamps run back, an event is placed as if received with the latest one
-    before it, so that nothing is lost and no other log is held up. Ties go by the order in which the logs were given.
+    Each log keeps its own order. Where its stamps run back, an event counts as received with the latest one
+    before it: nothing is lost, and no other log is delayed. Ties go by the order in which the logs were given.
     Iterating raises LogError where a file turns out to be no log.
     """
 
@@ -67,7 +67,7 @@ class LogSet:
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """What became of the content, by log; counts that are 0 are left out."""
+        """Counts of the content by log, without those that are 0."""
         return {str(log.file.path): log.counts() for log in self._logs}
 
     @property
@@ -84,8 +84,8 @@ class LogSet:
 
 
 def _ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same, read so many at a time: to read for a while and then to fuse for a while is faster by a sixth, as the
-    processor then finds code and data of each in its caches."""
+    """The same items, read READ_AHEAD at a time. Alternating long stretches of reading and fusing is faster by a sixth: code
+    and data stay in the processor's caches."""
     while some := list(islice(items, READ_AHEAD)):
         yield from some
 

@@ -48,7 +48,7 @@ def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
             counts["remote frames"] += 1
         else:
             try:
-                t_ns = round(message.timestamp * 1e6) * MICROSECOND  # a float of Unix time is good for no more than that
+                t_ns = round(message.timestamp * 1e6) * MICROSECOND  # a float of Unix time has no more digits
             except (ValueError, OverflowError):
                 counts["bad lines"] += 1
                 continue
@@ -57,7 +57,7 @@ def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
 
 
 class _Text(io.TextIOWrapper):
-    """The text of a log, which knows whether reading gets on."""
+    """The text of a log, which counts the lines that were read."""
 
     lines = 0
 
@@ -68,8 +68,8 @@ class _Text(io.TextIOWrapper):
 
 
 def _messages(log: LogFile) -> Iterator[can.Message]:
-    """python-can's messages. After a bad line of a text format reading goes on, at the loss of at most one more line;
-    a binary format ends there."""
+    """python-can's messages. After a bad line of a text format, reading goes on and loses at most one more line; a
+    binary format ends there."""
     text = None if log.suffix in BINARY else _Text(log.stream(), encoding="utf-8", errors="replace")
     damage = (*DAMAGE, *_mf4_damage(log)) if log.suffix == ".mf4" else DAMAGE
     try:
@@ -77,7 +77,7 @@ def _messages(log: LogFile) -> Iterator[can.Message]:
     except damage as error:
         raise LogError(f"{log.path}: is not a {log.suffix} log: {error}") from error
     with reader:
-        lines = -1  # how many were read when reading last broke off
+        lines = -1  # lines read when reading last failed
         while True:
             try:
                 yield from reader
@@ -86,7 +86,7 @@ def _messages(log: LogFile) -> Iterator[can.Message]:
                     log.counts["unreadable tail"] += 1
                     return
                 if text.lines <= lines:
-                    return  # the end; what broke is the reader, for want of a header
+                    return  # the end: the reader failed for lack of a header
                 lines = text.lines
                 log.counts["bad lines"] += 1
             else:
@@ -104,7 +104,7 @@ def _open(log: LogFile, text: _Text | None) -> can.io.generic.MessageReader:
     if log.suffix == ".db":
         return can.SqliteReader(log.path)
     with log.path.open("rb") as file:
-        if not file.read(8).startswith(MF4_MAGIC):  # asked first: asammdf complains on standard error besides raising
+        if not file.read(8).startswith(MF4_MAGIC):  # checked first: asammdf prints to standard error besides raising
             raise ValueError("it does not begin like one")
     return can.MF4Reader(log.path)
 

@@ -1,9 +1,9 @@
 """Reader of .tlog: MAVLink frames, each after the microseconds of Unix time of its receipt (8 bytes, big endian).
 
-The file may be damaged anywhere. While the records follow one another the magic bytes alone are looked at, and what the
-decoder does not want is passed over by its header; where the next record is missing, checksums decide, and the search for
-it goes on byte by byte. Stamps that jump are compared with their neighbours: a lone outlier is dropped with its record, a
-clock that was set is followed.
+The file may be damaged anywhere. While one record follows another, only the magic bytes are checked, and unwanted frames
+are skipped by their headers. Where the next record is missing, the search goes on byte by byte and checksums decide. A
+stamp that jumps is compared with its neighbours: a single outlier is dropped with its record, a clock that was set is
+followed.
 
 Counts: `records`, `bad bytes` (skipped between records), `truncated tail` (the last record is cut off), `bad stamps`
 (records dropped for their stamp), `clock set back`.
@@ -112,8 +112,8 @@ class _Records:
             counts["bad bytes"] += skipped
 
     def _plain(self, at: int) -> Generator[list[Received], None, int]:
-        """Cut the ordinary MAVLink 2 records from `at` on. Returns where the buffer runs short, or a record stands that is
-        to be looked at closely."""
+        """Cut the ordinary MAVLink 2 records from `at` on. Returns where the buffer ends, or where a record needs a closer
+        look."""
         buffer, unpack, take = self._buffer, RECORD_2.unpack_from, self._decoder.take
         until, records, last_us = len(buffer) - REACH, 0, self._last_us
         while at <= until and last_us is not None:

@@ -1,13 +1,13 @@
 """The state as MAVLink messages: for an autopilot's estimator, for a ground station, and texts for people. No I/O.
 
-Positions are told from an origin that stays where it is. North and east are metres on the map that the receiver itself
-uses to get latitude and longitude out of metres again: ArduPilot's and PX4's spheres differ from the ellipsoid by up to
-3 m a kilometre, and what counts is that they end at the latitude and longitude of the state. Down is the difference of
-heights, not a tangent plane's third axis, which at 10 km lies 8 m off. Velocity and attitude are those in north-east-down
-at the vehicle. `frames` has the tangent plane for those who ask for one.
+Positions are relative to a fixed origin. North and east are metres on the map that the receiver itself uses to convert
+metres back to latitude and longitude: ArduPilot's and PX4's spheres differ from the ellipsoid by up to 3 m per kilometre,
+and the receiver must end at the latitude and longitude of the state. Down is the difference of heights, not the third axis
+of a tangent plane, which at 10 km is off by 8 m. Velocity and attitude are in north-east-down at the vehicle.
+`fusiond.messages.local_frame` has the tangent plane.
 
-Angles in covariances are small errors of roll, pitch and yaw, as MAVLink has it, not rotations about north, east, down.
-The state tells no correlation between position, velocity and attitude: such elements are zero.
+Angles in covariances are small errors of roll, pitch and yaw, as MAVLink defines them, not rotations about north, east,
+down. The state has no correlation between position, velocity and attitude: such elements are zero.
 
 Stamps are those of the state: Unix time on the host's time line, the clock that answers TIMESYNC. PX4 converts stamps by
 its TIMESYNC offset (mavlink_receiver.cpp, Timesync.cpp), ArduPilot by the least lag it sees (JitterCorrection.cpp): both
@@ -106,7 +106,7 @@ class Form(NamedTuple):
 
 
 FORMS = {
-    # anything but this pair of frames is dropped without a word (GCS_Common.cpp, handle_odometry)
+    # any other pair of frames is dropped silently (GCS_Common.cpp, handle_odometry)
     "ardupilot": Form(common.MAV_FRAME_LOCAL_FRD, ardupilot_map),
     # LOCAL_FRD is taken as well, but as a frame of arbitrary heading (mavlink_receiver.cpp, VehicleOdometry.msg)
     "px4": Form(common.MAV_FRAME_LOCAL_NED, px4_map),
@@ -117,7 +117,7 @@ def odometry(message: StateMessage, state: State, origin: Origin, form: Form, qu
     """ODOMETRY: pose in the local frame, velocity and angular rate in body axes. `quality` is 1 to 100."""
     mat_nb = matrix(np.array(state.quaternion_nb))
     twist = mat_nb.T @ _square(state.covariance_velocity_m2ps2) @ mat_nb
-    rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # all that is known of them
+    rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # no more is known of them
     return common.MAVLink_odometry_message(
         message.t_ns // MICROSECOND, form.local_frame, common.MAV_FRAME_BODY_FRD,
         *local_position(state, origin, form.on), list(state.quaternion_nb),
@@ -191,7 +191,7 @@ def attitude_quaternion(message: StateMessage, state: State) -> Any:
 
 
 class Ratios(NamedTuple):
-    """Innovations over their gates, the greatest of the sources; not a number where there is none."""
+    """Largest ratio of innovation to gate over the sources; not a number where there is none."""
 
     velocity: float = math.nan
     horizontal: float = math.nan
@@ -225,7 +225,7 @@ def marker(message: StateMessage, state: State, origin: Origin, geoid_m: float) 
 
 
 def status_texts(severity: int, text: str, number: int) -> Iterator[Any]:
-    """STATUSTEXT, in as many chunks as it takes. `number`, from 1 to 65535, tells the chunks of one text from others'.
+    """STATUSTEXT, in as many chunks as needed. `number`, from 1 to 65535, marks the chunks of one text.
 
     A chunk with a zero in it is the last: where the text fills all of them, an empty one follows.
     """
@@ -241,7 +241,7 @@ def status_texts(severity: int, text: str, number: int) -> Iterator[Any]:
 
 
 class Pace:
-    """Lets through so many a second of what comes, by its stamps."""
+    """Thins messages to a rate, by their stamps."""
 
     def __init__(self, rate_hz: float) -> None:
         """0: none."""
@@ -249,7 +249,7 @@ class Pace:
         self._due_ns: int | None = None
 
     def due(self, t_ns: int) -> bool:
-        """Is one due at this instant? If so, it counts as passed."""
+        """Whether a message is due at this instant; if so, it counts as sent."""
         if self.rate_hz <= 0 or (self._due_ns is not None and t_ns < self._due_ns):
             return False
         period = round(1e9 / self.rate_hz)

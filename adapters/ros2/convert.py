@@ -29,7 +29,7 @@ class Converter:
     """One vehicle. Its origin and its odometry frame last as long as it does."""
 
     def __init__(self, section: Ros2) -> None:
-        self.unfit = 0  # states that were not sent, as there is none or it is not to be used
+        self.unfit = 0  # messages without a usable state, which are not sent
         self._section = section
         self._frame: LocalFrame | None = None
         if section.origin is not None:
@@ -58,7 +58,7 @@ class Converter:
         return f"{math.degrees(latitude):.9f}, {math.degrees(longitude):.9f}, {height:.3f}"
 
     def state(self, message: StateMessage) -> Iterator[tuple[str, bytes]]:
-        """Topic and CDR of what a state is told by; nothing between turns, and nothing of a state that is not fit."""
+        """Topic and CDR of each message of a state; none while it is not due, and none of a state that is not fit."""
         slot = int(message.t_ns // self._period_ns)
         if slot == self._slot:
             return

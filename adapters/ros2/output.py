@@ -25,9 +25,9 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[ros2] needs the extra ros2: pip install 'fusiond[ros2]'") from missing
 
-MOST_WAITING = 64  # messages between the estimator and the session: new ones are worth more
+MAX_WAITING = 64  # messages between the estimator and the session; the oldest are dropped
 TF_DEPTH = 100  # what tf2's own broadcasters keep
-CHECK_S = 1.0  # how often the router is looked for
+CHECK_S = 1.0  # between two checks of the router
 
 
 def topics(section: Ros2) -> Iterator[tuple[str, Topic]]:
@@ -47,13 +47,13 @@ class Ros2Output:
     def __init__(self, config: Config) -> None:
         self._section, self._directory = config.ros2, config.directory
         self.about = f"ROS 2 in domain {self._section.domain} by {', '.join(self._section.connect) or 'listening'}"
-        self.outbox = Outbox(MOST_WAITING, (StateMessage, HealthMessage))
+        self.outbox = Outbox(MAX_WAITING, (StateMessage, HealthMessage))
         self._converter = Converter(self._section)
         self._publishers: Mapping[str, Publisher] = {}  # those of the session
         self._sent = 0
 
     def session(self, stop: Event) -> None:
-        """Open, publish until told to stop, close. Raises OutputLost."""
+        """Open, publish until `stop` is set, close. Raises OutputLost."""
         section = self._section
         zenoh_section = ZenohSection(
             mode=section.mode, listen=section.listen, connect=section.connect, config_file=section.config_file
@@ -69,11 +69,11 @@ class Ros2Output:
             raise OutputLost(str(error)) from error
 
     def counts(self) -> dict[str, int]:
-        """What became of the messages so far."""
+        """Messages so far, counted by what was done with them."""
         return {"sent": self._sent, "states unfit": self._converter.unfit}
 
     def notes(self) -> dict[str, str]:
-        """What else there is to tell."""
+        """Notes for the health."""
         return {"origin": self._converter.origin}
 
     def _publish(self, session: zenoh.Session, stop: Event) -> None:

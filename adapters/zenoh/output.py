@@ -1,7 +1,7 @@
-"""Zenoh as a live output: publishes every message in a thread of its own, but states at once, and answers queries.
+"""Zenoh as a live output: publishes messages in a thread of its own, states directly, and answers queries.
 
-A state goes out in the estimator's thread: handing it to another one would make it later by the time that takes to wake,
-which on a busy machine is what a state loses most by. Zenoh only queues it, and where the queue is full drops it.
+A state is published in the estimator's thread: waking another thread would delay it, on a busy machine more than anything
+else does. Zenoh only queues the state, and drops it where the queue is full.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ QUEUE_MESSAGES = 1024  # a second of everything, and more
 
 
 class ZenohOutput:
-    """[zenoh] of a configuration. Nothing of it waits for a reader; what it cannot send it counts."""
+    """[zenoh] of a configuration. It never waits for a reader, and counts what it cannot send."""
 
     def __init__(self, config: Config) -> None:
         self.name = "zenoh"
@@ -36,7 +36,7 @@ class ZenohOutput:
         self._notes: dict[str, str] = {}
 
     def session(self, stop: Event) -> None:
-        """Open a session, publish until told to stop, close. Raises OutputLost."""
+        """Open a session, publish until `stop` is set, close. Raises OutputLost."""
         config = self._config
         try:
             with (
@@ -56,7 +56,7 @@ class ZenohOutput:
 
     def _serve(self, session: zenoh.Session, publisher: ZenohPublisher, stop: Event) -> None:
         self.outbox.at_once = partial(self._send_at_once, publisher)
-        for message in self.outbox.take(0):  # what was left while it was away; states, therefore, do not overtake each other
+        for message in self.outbox.take(0):  # messages queued while it was closed go first, so states stay in order
             if isinstance(message, StateAtInstant | InnovationMessage):
                 self.stale += 1
             else:
@@ -71,7 +71,7 @@ class ZenohOutput:
                     self._look(session)
 
     def _look(self, session: zenoh.Session) -> None:
-        """See to whom the session is connected. It may wait for Zenoh, and so is not done in the estimator's thread."""
+        """Look up the peers of the session. This may wait for Zenoh, so the estimator's thread must not do it."""
         routers, peers = len(session.info.routers_zid()), len(session.info.peers_zid())
         self._notes = {"session": f"{routers} routers, {peers} peers connected"}
 
@@ -84,7 +84,7 @@ class ZenohOutput:
         try:
             publisher.publish(state)
         except PublishError:
-            return False  # the output's own thread finds it out
+            return False  # the output's own thread finds the session lost
         self.answers.keep(state)
         self._sent_at_once += 1
         return True
@@ -95,11 +95,11 @@ class ZenohOutput:
         return self._sent + self._sent_at_once
 
     def counts(self) -> dict[str, int]:
-        """What became of the messages so far."""
+        """Messages so far, counted by what was done with them."""
         return {"sent": self.sent, "stale": self.stale, "sessions": self.sessions, "answered": self.answers.answered}
 
     def notes(self) -> dict[str, str]:
-        """To whom it is connected."""
+        """The peers it is connected to."""
         return self._notes
 
 

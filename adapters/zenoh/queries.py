@@ -1,7 +1,7 @@
 """Answers to Zenoh queries: the latest message of every kind, and the state at an instant within the horizon.
 
-They come from messages that were published, kept here; the filter is never touched. `fusiond/<vehicle>/state?t_ns=...`
-gives the state published nearest to that instant: what the filter knew then, not what late measurements have taught since.
+They come from published messages that are kept here, never from the filter. `fusiond/<vehicle>/state?t_ns=...`
+gives the state published nearest to that instant, as the filter knew it then.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Zenoh: a session that keeps to itself unless told otherwise, and the publishers of all messages.
+"""Zenoh: a session on loopback unless configured otherwise, and the publishers of all messages.
 
-A session hears and speaks on loopback only, by default: no multicast scouting, no gossip, no listener on other
-interfaces. Publishing hardly waits. Streams (state, settled, innovations) lose samples when a reader cannot keep up. What is
-told seldom (health, events, info, config) is kept here: readers that find one missing, or come late, fetch it.
+By default a session uses loopback only: no multicast scouting, no gossip, no listener on other interfaces. Publishing
+waits hardly at all. Streams (state, settled, innovations) lose samples when a reader cannot keep up. Rare messages
+(health, events, info, config) are kept here; readers that miss one or connect later fetch it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from fusiond.messages.types import MESSAGES, InnovationMessage, Message
 
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
-KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
+KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples kept for readers that missed them
 RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting: Zenoh's own is 1 to 4 s
 QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
 PATIENCE_US = 1000  # with which a sample waits for room there, as Zenoh has it
@@ -98,7 +98,7 @@ def _from_file(path: Path) -> zenoh.Config:
 
 @contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn Zenoh's error into ours: what was asked, and the reason without the places in Zenoh's own source."""
+    """Turn Zenoh's error into ours: what was tried, and the reason without locations in Zenoh's source."""
     try:
         yield
     except zenoh.ZError as error:
@@ -107,7 +107,7 @@ def _explained(what: str) -> Iterator[None]:
 
 
 class ZenohPublisher:
-    """Publishes messages of all kinds, and a liveliness token that tells readers as long as it does.
+    """Publishes messages of all kinds, and a liveliness token as long as it exists.
 
     A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared.
     """
@@ -152,7 +152,7 @@ class ZenohPublisher:
         return bool(status.matching)
 
     def publish(self, message: Message) -> None:
-        """Send a message to whoever subscribes. Raises PublishError where the session is closed."""
+        """Send a message to all subscribers. Raises PublishError where the session is closed."""
         where = message_key(message, self.vehicle)
         payload = encode(message, self._encoding)
         if self._closed:

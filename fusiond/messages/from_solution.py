@@ -1,4 +1,4 @@
-"""The state messages made from an estimate: units of the message, and no number that is not finite."""
+"""State messages made from an estimate: in the units of the message, and with finite numbers only."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ AnyState = TypeVar("AnyState", bound=StateAtInstant)
 
 
 def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
-    """The message that tells of an estimate.
+    """The message of an estimate.
 
     A state with a number that is not finite, or with a negative variance, is withheld: the message then has mode
-    `lost`, no state, and says in `fault` which number was to blame. So the publication goes on, and a reader sees why.
+    `lost` and no state, and `fault` names the number. Publication goes on, and a reader sees why.
     """
-    return _told(StateMessage, estimate, vehicle, outcomes)
+    return _message(StateMessage, estimate, vehicle, outcomes)
 
 
 def settled_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
     """The same of an estimate at the horizon."""
-    return _told(SettledMessage, estimate, vehicle, outcomes)
+    return _message(SettledMessage, estimate, vehicle, outcomes)
 
 
-def _told(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
+def _message(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
     state, fault = _checked(estimate.state) if estimate.state is not None else (None, None)
     return kind(
         vehicle=vehicle,
@@ -114,7 +114,7 @@ def _degrees(angles: tuple[float, float]) -> tuple[float, float]:
 
 
 def _block(estimate: StateEstimate, block: slice) -> Block:
-    """Symmetric to the last bit, which the turn into n leaves open."""
+    """A block of the covariance, made symmetric to the last bit: the rotation into n leaves it asymmetric by rounding."""
     a, b, c, d, e, f, g, h, i = estimate.covariance[block, block].ravel().tolist()
     b, c, f = (b + d) / 2, (c + g) / 2, (f + h) / 2
     return a, b, c, b, e, f, c, f, i

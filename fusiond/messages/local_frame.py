@@ -1,7 +1,7 @@
 """The published state in the frames that others use: a plane tangent to the Earth at an origin, axes by other conventions.
 
 Frames besides those of the glossary:
-    l   local: the tangent plane at an origin that stays where it is, its third axis vertical there
+    l   local: the tangent plane at a fixed origin, its third axis vertical there
     o   odometry: the local frame less the filter's corrections, so that the pose in it never jumps, but drifts
 In the convention ENU_FLU, l is east-north-up and b is forward-left-up; in NED_FRD they are as in the glossary.
 
@@ -19,7 +19,7 @@ from fusiond.maths.wgs84 import EARTH_RATE, ecef
 from fusiond.messages.types import Block, Quaternion, State, Triple
 from fusiond.units import SECOND
 
-GAP_NS = SECOND  # over a longer pause nothing is known of the way between
+GAP_NS = SECOND  # a longer pause is not bridged
 
 
 class Convention(NamedTuple):
@@ -131,7 +131,7 @@ class OdometryFrame:
 
 
 def _correction(before: LocalState, after: LocalState, dt: float) -> float:
-    """By how much [rad] the heading changed more than the angular rate accounts for."""
+    """Change of heading [rad] that the angular rate does not account for."""
     w, _, _, z = _product(after.quaternion_lb, _conjugate(before.quaternion_lb))
     rate = (before.angular_rate_l[2] + after.angular_rate_l[2]) / 2
     return math.remainder(2 * math.atan2(z, w) - rate * dt, math.tau)

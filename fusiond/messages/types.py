@@ -25,11 +25,11 @@ def _about(text: str) -> Meta:
 
 
 class Message(Struct, frozen=True, kw_only=True):
-    """What every published message is."""
+    """A published message."""
 
 
 class OutcomeCounts(Message, frozen=True, kw_only=True):
-    """What became of every measurement offered since the start, by its last word."""
+    """Measurements offered since the start, counted by their latest outcome."""
 
     fused: Annotated[int, _about("used")] = 0
     rejected: Annotated[int, _about("outside the innovation gate")] = 0
@@ -56,7 +56,7 @@ class State(Message, frozen=True, kw_only=True):
     ]
     gyro_bias_rps: Annotated[Triple, _about("gyro bias [rad/s] in b")]
     accel_bias_mps2: Annotated[Triple, _about("accelerometer bias [m/s^2] in b")]
-    wheel_scale: Annotated[float, _about("what all wheels read too much, as a fraction: 0.01 is 1 %")]
+    wheel_scale: Annotated[float, _about("fraction by which all wheels read too high: 0.01 is 1 %")]
     mount_deg: Annotated[tuple[float, float], _about("pitch and yaw [deg] of the IMU against the vehicle")]
     covariance_position_m2: Annotated[Block, _about("position covariance [m^2] in n, 3 x 3 row by row")]
     covariance_velocity_m2ps2: Annotated[Block, _about("velocity covariance [m^2/s^2] in n, 3 x 3 row by row")]
@@ -84,14 +84,14 @@ class StateAtInstant(Message, frozen=True, kw_only=True):
     age_ms: Annotated[
         float | None, _about("t_ns less the stamp of the last IMU sample behind it [ms]; null before the first")
     ]
-    resets: Annotated[int, _about("how often the state was reset, that is: jumped")]
-    fault: Annotated[str | None, _about("why the filter's state was withheld; null when all is well")] = None
-    state: Annotated[State | None, _about("the state; null while there is none to tell")]
-    outcomes: Annotated[OutcomeCounts, _about("what became of the measurements so far")]
+    resets: Annotated[int, _about("number of resets, that is jumps of the state")]
+    fault: Annotated[str | None, _about("why the state was withheld; null otherwise")] = None
+    state: Annotated[State | None, _about("the state; null while there is none")]
+    outcomes: Annotated[OutcomeCounts, _about("outcomes of the measurements so far")]
 
 
 class StateMessage(StateAtInstant, frozen=True, kw_only=True):
-    """The filter's answer at one instant, published on fusiond/<vehicle>/state."""
+    """The state at one instant, on fusiond/<vehicle>/state."""
 
 
 class SettledMessage(StateAtInstant, frozen=True, kw_only=True):
@@ -105,36 +105,36 @@ Severity = Literal["info", "notice", "warning", "critical"]
 
 
 class InnovationMessage(Message, frozen=True, kw_only=True):
-    """How one measurement was judged, as soon as it was, on fusiond/<vehicle>/innovations/<source>."""
+    """How one measurement was judged, as soon as that is known, on fusiond/<vehicle>/innovations/<source>."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    source: Annotated[str, _about("whose measurement")]
-    t_ns: Annotated[int, _about("instant it was true at [ns]")]
+    source: Annotated[str, _about("source of the measurement")]
+    t_ns: Annotated[int, _about("instant of the measurement, aligned [ns]")]
     t_receive_ns: Annotated[int, _about("when it was received [ns]")]
-    outcome: Annotated[OutcomeName, _about("what became of it; a late measurement of another source can change that yet")]
+    outcome: Annotated[OutcomeName, _about("its outcome, which a late measurement of another source can still change")]
     test_ratio: Annotated[float | None, _about("squared innovation over its limit, 1 at the gate; null if not judged")]
     innovation: Annotated[
         tuple[float, ...], _about("measurement less prediction, in the measurement's unit; empty if not judged")
     ]
-    variance: Annotated[tuple[float, ...], _about("variances that the filter expected of the innovation, per axis")]
+    variance: Annotated[tuple[float, ...], _about("variances that the filter expects of the innovation, per axis")]
     reason: Annotated[str | None, _about("why it is invalid; null otherwise")] = None
 
 
 class EventMessage(Message, frozen=True, kw_only=True):
-    """Something happened that a person may want to know at once, on fusiond/<vehicle>/events."""
+    """An event that an operator may want to know of at once, on fusiond/<vehicle>/events."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    t_ns: Annotated[int, _about("when it was seen [ns]")]
+    t_ns: Annotated[int, _about("when it was detected [ns]")]
     kind: Annotated[EventKind, _about("mode, reset, source_lost, source_found or source_status")]
     severity: Annotated[Severity, _about("info, notice, warning or critical")]
     subject: Annotated[str, _about("the mode entered, or the source; empty for a reset")]
-    text: Annotated[str, _about("what to tell people, in a line")]
+    text: Annotated[str, _about("one line for people")]
 
 
 class Quantiles(Message, frozen=True, kw_only=True):
-    """Of the latest few thousand latencies."""
+    """Quantiles of the latest few thousand latencies."""
 
     p50: Annotated[float, _about("median [ms]")]
     p90: Annotated[float, _about("90 % are below [ms]")]
@@ -143,11 +143,11 @@ class Quantiles(Message, frozen=True, kw_only=True):
 
 
 class LatencyHealth(Message, frozen=True, kw_only=True):
-    """How long things take inside; null before the first."""
+    """Latencies inside the daemon; null before the first."""
 
-    fused: Annotated[Quantiles | None, _about("from the receipt of a measurement to its having been fused [ms]")] = None
+    fused: Annotated[Quantiles | None, _about("from the receipt of a measurement to the end of its fusion [ms]")] = None
     published: Annotated[
-        Quantiles | None, _about("from the instant of a publication to its being handed to the outputs [ms]")
+        Quantiles | None, _about("from the instant of a publication to its handover to the outputs [ms]")
     ] = None
 
 
@@ -160,82 +160,82 @@ class ClockHealth(Message, frozen=True, kw_only=True):
     drift_ppm: Annotated[float, _about("how much faster the host's clock runs")]
     jitter_ms: Annotated[float, _about("mean of receipt less aligned stamp since the last re-alignment [ms]")]
     resets: Annotated[int, _about("re-alignments after a jump or a reboot")]
-    strays: Annotated[int, _about("stamps that made no sense")]
+    strays: Annotated[int, _about("implausible stamps")]
     note: Annotated[str, _about("why no better method is in use")] = ""
 
 
 class Probabilities(Message, frozen=True, kw_only=True):
-    """What a source is up to; they sum to 1."""
+    """Probabilities of the conditions that a source can be in; they sum to 1."""
 
-    nominal: Annotated[float, _about("as its configuration says")]
-    noisy: Annotated[float, _about("scatters more than that")]
-    biased: Annotated[float, _about("off to one side")]
-    frozen: Annotated[float, _about("repeats itself")]
-    absent: Annotated[float, _about("not there")]
+    nominal: Annotated[float, _about("as configured")]
+    noisy: Annotated[float, _about("noisier than configured")]
+    biased: Annotated[float, _about("offset to one side")]
+    frozen: Annotated[float, _about("repeats one value")]
+    absent: Annotated[float, _about("sends nothing")]
 
 
 class SourceHealth(Message, frozen=True, kw_only=True):
     """One source of measurements."""
 
-    outcomes: Annotated[OutcomeCounts, _about("what became of its measurements so far")]
-    present: Annotated[bool, _about("whether anything of it was received in the last 2 s")]
+    outcomes: Annotated[OutcomeCounts, _about("outcomes of its measurements so far")]
+    present: Annotated[bool, _about("whether anything was received from it in the last 2 s")]
     age_ms: Annotated[float | None, _about("since its last receipt [ms]; null before the first")] = None
-    rate_hz: Annotated[float, _about("receipts a second, lately")] = 0.0
+    rate_hz: Annotated[float, _about("receipts per second, recently")] = 0.0
     test_ratio: Annotated[float | None, _about("of its last measurement, 1 at the gate; null if none was judged")] = None
     nis_mean: Annotated[
         float | None, _about("mean over the horizon of the squared innovations per axis, in sigmas: 1 is as expected")
     ] = None
     clock: Annotated[ClockHealth | None, _about("the clock it stamps with; null before the first measurement")] = None
-    probabilities: Annotated[Probabilities | None, _about("what it is up to; null if that is not judged")] = None
-    status: Annotated[SourceStatus | None, _about("the likeliest of these; null if that is not judged")] = None
-    reason: Annotated[str | None, _about("what speaks for that status; null if nothing needs saying")] = None
+    probabilities: Annotated[Probabilities | None, _about("of its conditions; null if it is not judged")] = None
+    status: Annotated[SourceStatus | None, _about("its likeliest condition; null if it is not judged")] = None
+    reason: Annotated[str | None, _about("reason for that status; null if there is none")] = None
 
 
 class InputHealth(Message, frozen=True, kw_only=True):
     """One link or bus."""
 
     received: Annotated[int, _about("frames received")]
-    dropped: Annotated[int, _about("frames dropped, the oldest first, because the queue was full")]
-    counts: Annotated[dict[str, int], _about("what became of the others, by kind; and of the link")]
+    dropped: Annotated[int, _about("frames dropped because the queue was full")]
+    counts: Annotated[dict[str, int], _about("other counts of its frames and of the link, by kind")]
 
 
 class OutputHealth(Message, frozen=True, kw_only=True):
     """One output."""
 
-    offered: Annotated[int, _about("messages left for it")]
-    dropped: Annotated[int, _about("messages dropped, the oldest first, because it was slow or away")]
+    offered: Annotated[int, _about("messages put into its queue")]
+    dropped: Annotated[int, _about("messages dropped, the oldest first, because the output was slow or away")]
     latency_ms: Annotated[
-        Quantiles | None, _about("from the instant of a publication to its being sent or taken up here; null before")
+        Quantiles | None, _about("from the instant of a publication to its being sent or taken from the queue; null before")
     ] = None
-    counts: Annotated[dict[str, int], _about("what became of the others, by kind")]
-    notes: Annotated[dict[str, str], _about("what else there is to tell, such as whether the autopilot uses it")]
+    counts: Annotated[dict[str, int], _about("other counts, by kind")]
+    notes: Annotated[dict[str, str], _about("further notes, such as whether the autopilot uses the state")]
 
 
 class Calibration(Message, frozen=True, kw_only=True):
-    """Something of the installation that is learnt."""
+    """A parameter of the installation that is learnt."""
 
     value: Annotated[float, _about("as learnt so far, in the unit that its name ends in")]
     sigma: Annotated[float, _about("one standard deviation of it")]
 
 
 class HealthMessage(Message, frozen=True, kw_only=True):
-    """How everything is, each second and at every change of mode, resets or sources, on fusiond/<vehicle>/health."""
+    """Health of all parts, each second and at every change of mode, resets or sources, on fusiond/<vehicle>/health."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    t_ns: Annotated[int, _about("the instant it tells of [ns]")]
+    t_ns: Annotated[int, _about("the instant it describes [ns]")]
     version: Annotated[str, _about("of fusiond")]
     uptime_s: Annotated[float, _about("since the first measurement [s]")]
     mode: Annotated[Mode, _about("as in the state")]
-    resets: Annotated[int, _about("how often the state was reset, that is: jumped")]
-    reset_reason: Annotated[str | None, _about("why it was reset the last time; null before")] = None
+    resets: Annotated[int, _about("number of resets, that is jumps of the state")]
+    reset_reason: Annotated[str | None, _about("reason of the last reset; null before the first")] = None
     outcomes: Annotated[OutcomeCounts, _about("over all sources")]
-    latency_ms: Annotated[LatencyHealth, _about("how long things take inside")]
+    latency_ms: Annotated[LatencyHealth, _about("latencies inside the daemon")]
     sources: Annotated[dict[str, SourceHealth], _about("by name")]
     inputs: Annotated[dict[str, InputHealth], _about("by kind and name, such as mavlink.fc")]
     outputs: Annotated[dict[str, OutputHealth], _about("by name, such as zenoh")]
     calibration: Annotated[
-        dict[str, Calibration], _about("what is learnt of the installation: what each is more than configured, by name")
+        dict[str, Calibration], _about("learnt corrections to the configured installation, by name")
     ] = {}
 
 
@@ -245,10 +245,10 @@ class InfoMessage(Message, frozen=True, kw_only=True):
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
     version: Annotated[str, _about("of fusiond")]
-    kernel: Annotated[Literal["compiled", "numpy"], _about("compiled, or its slower twin in NumPy")]
+    kernel: Annotated[Literal["compiled", "numpy"], _about("compiled, or the slower one in NumPy")]
     encoding: Annotated[Encoding, _about("of everything published over Zenoh")]
     schemas: Annotated[dict[str, int], _about("versions of the messages' layouts, by the last part of the key")]
-    keys: Annotated[dict[str, str], _about("what is published where, by the last part of the key")]
+    keys: Annotated[dict[str, str], _about("where each message is published, by the last part of the key")]
     sources: Annotated[dict[str, str], _about("what each source measures: imu, gnss_position, ...")]
     config: Annotated[dict[str, Any], _about("the configuration, defaults filled in")]
 

@@ -1,4 +1,4 @@
-"""What the tests of the clock share: stamped events, and series of them."""
+"""Stamped events, and series of them, for the tests of the clock."""
 
 from __future__ import annotations
 

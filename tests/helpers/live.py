@@ -1,4 +1,4 @@
-"""What the tests of the live daemon share: a configuration, an autopilot's frames, a daemon in a thread."""
+"""A configuration, an autopilot's frames and a daemon in a thread, for the tests of the live daemon."""
 
 from __future__ import annotations
 

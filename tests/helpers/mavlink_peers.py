@@ -1,4 +1,4 @@
-"""What the tests of MAVLink out share: states of a moving vehicle, peers over UDP and TCP, and stand-ins for autopilots.
+"""States of a moving vehicle, peers over UDP and TCP, and stand-ins for autopilots, for the tests of MAVLink outputs.
 
 The stand-ins drop and refuse what ArduPilot and PX4 do, and turn what they take into latitude, longitude and velocity
 over ground by the autopilots' own equations. Sources: ArduPilot's GCS_Common.cpp (handle_odometry,
@@ -264,7 +264,7 @@ class Taken(NamedTuple):
 
 
 class ArduPilot:
-    """With the EKF's origin where the test puts it. `dropped` counts what it drops without a word."""
+    """With the EKF's origin where the test puts it. `dropped` counts what it drops silently."""
 
     M_PER_E7 = 0.011131884502145034  # LOCATION_SCALING_FACTOR
 
