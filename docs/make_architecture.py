@@ -14,7 +14,8 @@ PAGE = ROOT / "docs" / "architecture.md"
 WIDTH = 120
 sys.path.insert(0, str(ROOT))
 
-from tests.unit.project.test_layers import ACROSS, LAYERS, NEVER, ROOTS  # noqa: E402 - the table is that test's
+from tests.helpers.paths import ROOTS  # noqa: E402
+from tests.unit.project.test_layers import ACROSS, LAYERS, NEVER  # noqa: E402 - the table is that test's
 
 SOURCES = {".py", ".pyx", ".pxi", ".pxd"}
 

@@ -15,7 +15,7 @@ from fusiond.events import Received
 from fusiond.units import SECOND
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
-from fusiond_adapters.registry import LOG_FORMATS
+from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
 
@@ -158,9 +158,9 @@ def _known() -> str:
 def _split(argument: str, config: Config) -> tuple[str | None, str]:
     """`NAME=path` into its parts; a `=` that does not follow a link's or bus's name belongs to the path."""
     name, equals, path = argument.partition("=")
-    if equals and (name in config.mavlink or name in config.can):
+    known = [configured for section in INPUTS for configured in getattr(config, section)]
+    if equals and name in known:
         return name, path
     if equals and name.isidentifier() and not Path(argument).exists():
-        known = ", ".join((*config.mavlink, *config.can)) or "none"
-        raise LogError(f"{argument}: there is no link or bus '{name}'; configured: {known}")
+        raise LogError(f"{argument}: there is no link or bus '{name}'; configured: {', '.join(known) or 'none'}")
     return None, argument

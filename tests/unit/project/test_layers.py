@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.paths import ROOT
+from tests.helpers.paths import ROOTS
 
 LAYERS = (  # from the bottom; those of one line do not import each other
     ("fusiond",),  # the package's own file: glossary and version
@@ -41,7 +41,6 @@ NEVER = {  # imports that the order would allow
 }
 INPUT_AND_OUTPUT = {"socket", "time", "asyncio", "subprocess", "pymavlink", "can", "cantools", "zenoh", "matplotlib"}
 OPENS_THINGS = ("fusiond.ports", "fusiond_adapters", "fusiond.app", "fusiond.client", "fusiond.__main__", "fusiond.config")
-ROOTS = {"fusiond": ROOT / "fusiond", "fusiond_adapters": ROOT / "adapters"}
 
 
 def name_of(path: Path) -> str:
