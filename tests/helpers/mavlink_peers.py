@@ -26,6 +26,7 @@ from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import OutcomeCounts, State, StateMessage
 from fusiond.ports.inputs import Inbox
+from fusiond.units import MILLISECOND as MS
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.mavlink.link import MavlinkLink
 from fusiond_adapters.mavlink.talk import MavlinkTalk
@@ -34,7 +35,6 @@ from tests.helpers.network import DEADLINE
 
 SYSTEM, COMPONENT = 7, 1
 CLOCK = HostClock()
-MS = 10**6  # ns
 Triple = tuple[float, float, float]
 
 
