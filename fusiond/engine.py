@@ -15,15 +15,13 @@ from fractions import Fraction
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import ImuSample, Received
-from fusiond.filter.step import Outcome
 from fusiond.filter.stored_state import StoredState
-from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
+from fusiond.messages.outcomes import totals
+from fusiond.messages.types import StateMessage, state_message
 
 SECOND = 1_000_000_000  # ns
 LONGEST_SILENCE_NS = 60 * SECOND  # ticks go on for so long after an event; a longer hole is passed over
 RATE_DENOMINATOR = 1_000_000  # a rate is taken as a fraction with at most this, so that ticks never drift
-
-FIELDS = {outcome: outcome.name.lower() for outcome in Outcome}  # of OutcomeCounts
 
 OnTick = Callable[[int, StateMessage], None]  # time since the first event [ns], message
 
@@ -130,9 +128,3 @@ class Engine:
         self._on_tick(since_ns, message)
         self.rows += 1
         self._tick += 1
-
-
-def totals(fusion: Fusion) -> OutcomeCounts:
-    """Counts of outcomes over all sources."""
-    counts = fusion.history.counts.sum(axis=0).tolist()
-    return OutcomeCounts(**{name: counts[outcome] for outcome, name in FIELDS.items()})

@@ -16,7 +16,7 @@ import numpy as np
 
 from fusiond import __version__
 from fusiond.config.schema import Config
-from fusiond.engine import FIELDS, RATE_DENOMINATOR, Engine, totals
+from fusiond.engine import RATE_DENOMINATOR, Engine
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.estimator.solution import Mode
 from fusiond.events import Received
@@ -25,6 +25,7 @@ from fusiond.filter.hot_start import decided
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import BLOWN, LAST_RATIO, NEVER, T_FUSED, T_REJECTED, T_START
 from fusiond.messages.innovations import Innovations
+from fusiond.messages.outcomes import outcome_counts, totals
 from fusiond.messages.types import (
     Calibration,
     ClockHealth,
@@ -33,7 +34,6 @@ from fusiond.messages.types import (
     InputHealth,
     LatencyHealth,
     Message,
-    OutcomeCounts,
     OutputHealth,
     Probabilities,
     Severity,
@@ -162,7 +162,7 @@ class Sources:
         for i, source in enumerate(fusion.plan.sources):
             last = self._received.get(source)
             found[source] = SourceHealth(
-                outcomes=OutcomeCounts(**{name: counts[i][outcome] for outcome, name in FIELDS.items()}),
+                outcomes=outcome_counts(counts[i]),
                 present=source in present,
                 age_ms=None if last is None else (t_ns - last) / 1e6,
                 rate_hz=self._rates[source],

@@ -274,6 +274,8 @@ def replay(options: Options) -> Summary:
         run = Replay(config, wants)
         share = options.share or (lambda _: logs.bytes_read / logs.bytes_total)
         run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr))
+    if trace:
+        trace.read_outcomes()
     names = _names(logs.counts)
     if run.first_ns is None:
         met = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())

@@ -23,7 +23,7 @@ from fusiond.config.schema import Config, Zenoh
 from fusiond.engine import SECOND, Engine
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Received
 from fusiond.filter.step import Outcome
-from fusiond.messages.innovations import NAMES
+from fusiond.messages.outcomes import NAMES
 from fusiond.messages.schedule import Publication
 from fusiond.messages.types import (
     ConfigMessage,
