@@ -1,7 +1,8 @@
 """Zenoh as a live output: publishes every message in a thread of its own, but states at once, and answers queries.
 
 A state goes out in the estimator's thread: handing it to another one would make it later by the time that takes to wake,
-which on a busy machine is what a state loses most by. Zenoh only queues it, and where the queue is full drops it.
+which on a busy machine is what a state loses most by. Zenoh only queues it, and where the queue is full drops it. A replay
+has patience instead: everything goes through the outbox, in order, and Zenoh waits for its readers.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ QUEUE_MESSAGES = 1024  # a second of everything, and more
 
 
 class ZenohOutput:
-    """[zenoh] of a configuration. Nothing of it waits for a reader; what it cannot send it counts."""
+    """[zenoh] of a configuration. Live, nothing of it waits for a reader; what it cannot send it counts."""
 
     def __init__(self, config: Config) -> None:
         self.name = "zenoh"
@@ -36,11 +37,11 @@ class ZenohOutput:
 
     def session(self, stop: Event) -> None:
         """Open a session, publish until told to stop, close. Raises OutputLost."""
-        config = self._config
+        config, lossless = self._config, self.outbox.patience_s > 0
         try:
             with (
-                open_session(config.zenoh, config.directory, patient=False) as session,
-                ZenohPublisher(session, config.vehicle.name, config.publish.encoding) as publisher,
+                open_session(config.zenoh, config.directory, patient=lossless) as session,
+                ZenohPublisher(session, config.vehicle.name, config.publish.encoding, lossless=lossless) as publisher,
                 self.answers.declared(session),
             ):
                 self.sessions += 1
@@ -56,7 +57,7 @@ class ZenohOutput:
     def _serve(self, session: zenoh.Session, publisher: ZenohPublisher, stop: Event) -> None:
         self.outbox.at_once = partial(self._send_at_once, publisher)
         for message in self.outbox.take(0):  # what was left while it was away; states, therefore, do not overtake each other
-            if isinstance(message, StateAtInstant | InnovationMessage):
+            if isinstance(message, StateAtInstant | InnovationMessage) and not self.outbox.patience_s:
                 self.stale += 1
             else:
                 self._send(publisher, message)

@@ -35,9 +35,13 @@ class Outbox:
         self.latency = RecentLatencies()  # from the instant of a state to its being taken, or sent at once
         self.at_once: Callable[[StateMessage], bool] | None = None
         """Sends a state in the estimator's thread, and never waits. False: it cannot just now, and the state is queued."""
+        self.patience_s = 0.0
+        """How long `put` may wait for room before it drops the oldest message; 0 in a live run. With patience nothing is to
+        be lost, so `put` queues states too."""
         self._wants = wants
         self._messages: deque[Message] = deque(maxlen=size)
-        self._filled = Condition()
+        self._stalled = False  # it waited in vain, and nothing has been taken since
+        self._changed = Condition()
         self._now: Callable[[], int] | None = None
         self._on_opened: Callable[[], None] | None = None
 
@@ -46,31 +50,36 @@ class Outbox:
         from then on latencies are measured by `now`."""
         self._now, self._on_opened = now, on_opened
 
-    def put(self, message: Message) -> None:
-        """Leave a message, if it is of a wanted kind. Never waits for the reader."""
+    def put(self, message: Message, *, may_wait: bool = True) -> None:
+        """Leave a message, if it is of a wanted kind. Never waits for the reader without `patience_s`; the reader's own
+        thread must not (`may_wait`)."""
         if not isinstance(message, self._wants):
             return
-        with self._filled:
+        with self._changed:
             self.offered += 1
-        if type(message) is StateMessage and (send := self.at_once) and send(message):
+        if type(message) is StateMessage and not self.patience_s and (send := self.at_once) and send(message):
             if self._now:
                 self.latency.add(max(0, self._now() - message.t_ns))
             return
-        with self._filled:
-            self.dropped += len(self._messages) == self._messages.maxlen
+        with self._changed:
+            if may_wait and self.patience_s and self._is_full() and not self._stalled:
+                self._stalled = not self._changed.wait_for(lambda: not self._is_full(), self.patience_s)
+            self.dropped += self._is_full()
             self._messages.append(message)
-            self._filled.notify()
+            self._changed.notify_all()
 
     def take(self, timeout_s: float) -> list[Message]:
         """All that was left since the last time, oldest first; waits up to `timeout_s` for the first. Empty after that."""
         if self._on_opened:
             on_opened, self._on_opened = self._on_opened, None
             on_opened()
-        with self._filled:
+        with self._changed:
             if not self._messages:
-                self._filled.wait(timeout_s)
+                self._changed.wait(timeout_s)
             messages = list(self._messages)
             self._messages.clear()
+            self._stalled = False
+            self._changed.notify_all()
         if self._now:
             now = self._now()
             for message in messages:
@@ -78,10 +87,18 @@ class Outbox:
                     self.latency.add(max(0, now - message.t_ns))
         return messages
 
+    @property
+    def waiting(self) -> int:
+        """Messages that nobody has taken yet."""
+        return len(self._messages)
+
+    def _is_full(self) -> bool:
+        return len(self._messages) == self._messages.maxlen
+
     def rouse(self) -> None:
         """Let a waiting `take` return: there is something other than messages to look at, such as a stop."""
-        with self._filled:
-            self._filled.notify_all()
+        with self._changed:
+            self._changed.notify_all()
 
 
 class LiveOutput(Protocol):

@@ -24,7 +24,6 @@ from fusiond.engine import SECOND, Engine
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Received
 from fusiond.filter.step import Outcome
 from fusiond.messages.outcomes import NAMES
-from fusiond.messages.schedule import Publication
 from fusiond.messages.types import (
     ConfigMessage,
     EventMessage,
@@ -327,12 +326,11 @@ def test_a_reload_is_told(tmp_path: Path) -> None:
 
 
 class Player:
-    """An engine and its publication, played by hand."""
+    """An engine, played by hand."""
 
     def __init__(self, settings: Config) -> None:
         self.told: list[Message] = []
-        self._engine = Engine(settings, 10.0, lambda since, message: self.told.extend(self._publication.at(since, message)))
-        self._publication = Publication(settings, self._engine)
+        self._engine = Engine(settings, self.told.append, rate_hz=10.0)
 
     def play(self, seconds: float, begin_s: float = 0.0, metres_off: Callable[[float], float] = lambda _: 0.0) -> None:
         """A vehicle at rest, whose receiver is off to the north by so many metres at a second."""
@@ -347,11 +345,7 @@ class Player:
 
     def _take(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
         t_ns = 1_700_000_000 * SECOND + round(second * SECOND)
-        event = Received(source, t_ns, "unix", t_ns, t_ns, payload)
-        self._engine.advance(t_ns)
-        receipt = self._engine.take(event)
-        assert receipt is not None
-        self._publication.add(event, receipt)
+        assert self._engine.feed(Received(source, t_ns, "unix", t_ns, t_ns, payload)) is not None
 
 
 def test_a_reset_is_told_with_its_reason(tmp_path: Path) -> None:

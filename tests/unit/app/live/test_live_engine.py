@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common
 
 from fusiond.app.live.daemon import Daemon
-from fusiond.app.live.live_engine import MOST_FRAMES, LiveEngine
+from fusiond.app.live.live_engine import MAX_FRAMES, LiveEngine
 from fusiond.messages.types import Message, StateMessage
 from fusiond_adapters.logs.play import PlayedClock
 from tests.helpers.live import Autopilot, configuration
@@ -53,10 +53,10 @@ def test_the_state_goes_first_and_what_was_received_after_it_waits(rig: Rig) -> 
     rig.receive(0)  # and so the first tick, at which everything is told
     assert not rig.live.step(rig.inputs, give_way=True)
     assert [type(message) for message in rig.said] == [StateMessage]
-    assert rig.live.unfinished
-    rig.live.finish_tick()
+    assert rig.live.engine.unfinished
+    rig.live.engine.flush()
     assert len(rig.said) > 2
-    assert not rig.live.unfinished
+    assert not rig.live.engine.unfinished
     for number in range(1, 4):  # at 3, 6 and 9 ms
         rig.receive(number)
         assert not rig.live.step(rig.inputs, give_way=True)
@@ -101,7 +101,7 @@ def test_a_tick_that_waited_for_a_sample_gives_way_too(tmp_path: Path) -> None:
     for number in range(4):
         rig.receive(number)
         rig.live.step(rig.inputs, give_way=True)
-    rig.live.finish_tick()
+    rig.live.engine.flush()
     before, taken = len(rig.said), rig.taken()
     for number in (4, 5, 6):
         rig.receive(number)
@@ -133,7 +133,7 @@ def test_giving_way_changes_no_message(tmp_path: Path, on_imu: bool) -> None:
             rig.receive(number)
             while rig.live.step(rig.inputs, give_way=give_way):
                 pass
-        rig.live.finish_tick()
+        rig.live.engine.flush()
         found.append(rig.said)
     assert sum(isinstance(message, StateMessage) for message in found[0]) == SAMPLES * STEP_MS // 10
     assert found[0] == found[1]
@@ -149,12 +149,12 @@ def test_a_stall_is_caught_up_with_every_tick(rig: Rig) -> None:
 
 
 def test_a_flood_is_taken_in_parts(rig: Rig) -> None:
-    for number in range(2 * MOST_FRAMES + 10):
+    for number in range(2 * MAX_FRAMES + 10):
         rig.receive(number)
     for part in range(1, 3):
         assert rig.live.step(rig.inputs)
-        assert rig.taken() == part * MOST_FRAMES
+        assert rig.taken() == part * MAX_FRAMES
     assert not rig.live.step(rig.inputs)
-    assert rig.taken() == 2 * MOST_FRAMES + 10
+    assert rig.taken() == 2 * MAX_FRAMES + 10
     ticks = {message.t_ns for message in rig.said if isinstance(message, StateMessage)}
-    assert len(ticks) == -(-(2 * MOST_FRAMES + 10) * STEP_MS // 10)
+    assert len(ticks) == -(-(2 * MAX_FRAMES + 10) * STEP_MS // 10)

@@ -12,14 +12,16 @@ from msgspec.structs import replace
 
 from fusiond.app.progress import line, shown
 from fusiond.app.replay.comparison import Errors, Truth, TruthRow, Window
-from fusiond.app.replay.replay import Pacer, Replay, Wants, Withheld, parse_interval, parse_withheld
+from fusiond.app.replay.intervals import Withheld, parse_interval, parse_withheld
+from fusiond.app.replay.pacer import Pacer
+from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
 from fusiond.errors import UsageError
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import GnssPosition, ImuSample, Invalid, Received, WheelSpeed
-from fusiond.messages.types import OutcomeCounts, StateMessage, csv_row, state_message
+from fusiond.messages import Message, OutcomeCounts, StateMessage, csv_row, state_message
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
@@ -116,16 +118,20 @@ def test_a_tick_waits_for_an_inertial_sample_for_half_a_period(setup: Config) ->
     assert [t / MS for t in instants] == [0, 130, 250, 300, 449]
 
 
-def test_another_sensor_does_not_end_the_wait(setup: Config) -> None:
+def test_another_sensor_does_not_end_the_wait(setup: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     waiting = replace(setup, publish=replace(setup.publish, on_imu=True))
     other = Received("imu1", 0, "", None, T0 + 110 * MS, ImuSample((0.0, 0.0, -9.8), (0.0, 0.0, 0.0)))
     order: list[tuple[int, int]] = []
-    engine = Engine(waiting, 10.0, lambda since, _: order.append((since, engine.now_ns - T0)))
+
+    def note(message: Message) -> None:
+        assert isinstance(message, StateMessage)
+        order.append((message.t_ns - T0, engine.now_ns - T0))
+
+    engine = Engine(waiting, note, rate_hz=10.0, only_states=True)
+    known = engine.fusion.receive(imu(T0))
+    monkeypatch.setattr(engine.fusion, "receive", lambda _: known)  # the other is not of this configuration
     for event in (imu(T0), other, imu(T0 + 120 * MS, 1)):
-        engine.advance(event.t_receive_ns)
-        if event is not other:  # which this configuration does not know
-            engine.take(event)
-        engine.taken(event)
+        engine.feed(event)
     assert order == [(0, 0), (120 * MS, 120 * MS)]
 
 
