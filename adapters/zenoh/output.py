@@ -7,6 +7,7 @@ has patience instead: everything goes through the outbox, in order, and Zenoh wa
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from threading import Event
 
@@ -16,9 +17,11 @@ from fusiond.config.schema import Config
 from fusiond.messages.types import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant, StateMessage
 from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
 from fusiond_adapters.zenoh.queries import Answers
-from fusiond_adapters.zenoh.session import PublishError, ZenohPublisher, open_session
+from fusiond_adapters.zenoh.session import TELL_LAST_S, PublishError, ZenohPublisher, open_session
 
 QUEUE_MESSAGES = 1024  # a second of everything, and more
+READER_S = 0.002  # that a reader may take for a message at the end of a replay, see _linger
+MIN_LINGER_S, MAX_LINGER_S = TELL_LAST_S + 0.2, 5.0  # all that waits in Zenoh's queues is some thousands of messages
 
 
 class ZenohOutput:
@@ -31,6 +34,7 @@ class ZenohOutput:
         self.outbox = Outbox(QUEUE_MESSAGES, tuple(MESSAGES.values()))
         self.sessions = self.stale = 0
         self._sent = self._sent_at_once = 0  # by the one thread and the other
+        self._read_s = 0.0  # monotonic: when a slow reader would have taken all that was sent
         self.answers = Answers(config)
         self._config = config
         self._notes: dict[str, str] = {}
@@ -69,6 +73,14 @@ class ZenohOutput:
                 self._send(publisher, message)
                 if isinstance(message, HealthMessage):  # for the next one: each second or so
                     self._look(session)
+        if self.outbox.patience_s:
+            self._linger(publisher)
+
+    def _linger(self, publisher: ZenohPublisher) -> None:
+        """A session that is closed drops what its readers have not taken yet, and Zenoh does not say what they have: give
+        them the time in which one that takes READER_S for each message would have taken all."""
+        longest_s = MAX_LINGER_S if publisher.matched else MIN_LINGER_S
+        time.sleep(min(longest_s, max(MIN_LINGER_S, self._read_s - time.monotonic())))
 
     def _look(self, session: zenoh.Session) -> None:
         """See to whom the session is connected. It may wait for Zenoh, and so is not done in the estimator's thread."""
@@ -79,6 +91,7 @@ class ZenohOutput:
         publisher.publish(message)
         self.answers.keep(message)
         self._sent += 1
+        self._read_s = max(self._read_s, time.monotonic()) + READER_S
 
     def _send_at_once(self, publisher: ZenohPublisher, state: StateMessage) -> bool:
         try:

@@ -21,7 +21,7 @@ import pytest
 from fusiond.config.explain import description
 from fusiond.config.schema import Foxglove, Mcap, Prometheus
 from fusiond.config.toml import ConfigError
-from fusiond.messages.types import EventMessage, HealthMessage, State, StateMessage, encode
+from fusiond.messages import EventMessage, HealthMessage, InnovationMessage, State, StateMessage, encode
 from fusiond.ports.outputs import OutputLost
 from fusiond_adapters.foxglove import layout as foxglove_layout
 from fusiond_adapters.foxglove.converter import FOXGLOVE, LOG, POSE, TOPICS, Converter, channels, innovations_topic
@@ -263,6 +263,17 @@ def test_a_client_gets_the_states_and_events() -> None:
     assert json.loads(got[LOG][1])["message"] == event.text
     assert json.loads(got[POSE][1])["frame_id"] == "local_enu"
     assert server.url is None and server.counts()["records"] >= 5
+
+
+def test_a_topic_that_it_does_not_have_is_counted() -> None:
+    server = server_of()
+    stray = InnovationMessage(vehicle="tested", source="imu0", t_ns=1, t_receive_ns=2, outcome="invalid",
+                              test_ratio=None, innovation=(), variance=())  # fmt: skip
+    with serving(server) as lost:
+        server.outbox.put(stray)
+        server.outbox.put(states()[-1])
+        until(lambda: server.counts()["records"] > 0)
+    assert not lost and server.counts()["unknown topics"] == 1
 
 
 def test_a_taken_port_is_told_and_tried_again() -> None:
