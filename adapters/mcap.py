@@ -52,6 +52,7 @@ class McapFile:
     def __init__(self, path: Path, config: Config) -> None:
         self.written = 0  # records that have left for the disk
         self.waiting = 0  # records of the chunk that is being gathered
+        self.unknown = 0  # records of topics that the file does not have; they are left out
         self._path, self._out = path, _Out(path)
         self._writer = Writer(self._out, chunk_size=CHUNK_BYTES)
         self._writer.start(library=LIBRARY)
@@ -66,12 +67,16 @@ class McapFile:
 
     def add(self, record: Record) -> None:
         """Append a record."""
+        channel = self._channels.get(record.topic)
+        if channel is None:
+            self.unknown += 1
+            return
         second = record.publish_ns // SECOND
         if second != self._second:
             self.flush()
             self._second = second
         self.waiting += 1
-        self._writer.add_message(self._channels[record.topic], record.log_ns, record.data, record.publish_ns)
+        self._writer.add_message(channel, record.log_ns, record.data, record.publish_ns)
 
     def flush(self) -> None:
         """End the chunk, so that what was added survives a crash of this process."""
@@ -187,10 +192,10 @@ class McapRecorder:
             raise OutputLost(f"{error.filename or self._folder}: {error.strerror}") from error
 
     def counts(self) -> dict[str, int]:
-        """Records and files."""
+        """Records, those lost or of a topic that the files do not have, and files."""
         file = self._file
-        written = self._ended + (file.written if file else 0)
-        return {"records": written, "records lost": self.lost, "files": self.files}
+        written, unknown = (file.written, file.unknown) if file else (0, 0)
+        return {"records": self._ended + written, "records lost": self.lost + unknown, "files": self.files}
 
     def notes(self) -> dict[str, str]:
         """Where the files are."""
@@ -234,6 +239,7 @@ class McapRecorder:
             how(self._file)
             file, self._file = self._file, None
             self._ended += file.written
+            self.lost += file.unknown
 
 
 def make(config: Config, _: Around) -> Sequence[LiveOutput]:

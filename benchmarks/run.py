@@ -306,7 +306,7 @@ def start_lines(repeats: int) -> list[Line]:
     lines = []
     for what, code in (
         ("import the core (fusiond.estimator.fusion)", "import fusiond.estimator.fusion"),
-        ("import all of replay", "import fusiond.app.replay.replay"),
+        ("import all of replay", "import fusiond.app.replay.job"),
         ("fusiond --version", "import fusiond.__main__ as m\ntry: m.main(['--version'])\nexcept SystemExit: pass"),
     ):
         seconds = statistics.median(run_python("-c", code)[0] for _ in range(repeats))

@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 
-from fusiond.app.replay.replay import parse_interval
+from fusiond.app.replay.intervals import parse_interval
 from fusiond.config import load as config
 from fusiond.events import ImuSample
 from fusiond.timeline.clock import Clock

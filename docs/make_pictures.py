@@ -21,7 +21,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from fusiond.app.demo import demo
 from fusiond.app.replay.comparison import Truth, Window, displacement, parse_truth
-from fusiond.app.replay.replay import Options, Replay, Wants, replay
+from fusiond.app.replay.job import Options, replay
+from fusiond.app.replay.replay import Replay, Wants
 from fusiond.app.replay.summary import Summary
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config

@@ -9,3 +9,7 @@ class UsageError(Exception):
 
 class UnusableError(Exception):
     """An input that cannot be used, or an output that cannot be written; the message says which and why."""
+
+
+class OutputError(UnusableError):
+    """A result cannot be delivered; the message says where and why."""

@@ -30,6 +30,7 @@ class FoxgloveServer:
         self.about = f"Foxglove server on {config.foxglove.host}:{config.foxglove.port}"
         self.outbox = Outbox(MAX_WAITING, SHOWN)
         self.shown = 0  # records given to the server
+        self.unknown = 0  # records of topics that it does not have; they are left out
         self.url: str | None = None  # while it runs
         self._config = config
         self._converter = Converter(config.foxglove.rate_hz)
@@ -55,8 +56,8 @@ class FoxgloveServer:
             server.stop()
 
     def counts(self) -> dict[str, int]:
-        """Records."""
-        return {"records": self.shown}
+        """Records shown, and those of topics that it does not have."""
+        return {"records": self.shown, "unknown topics": self.unknown}
 
     def notes(self) -> dict[str, str]:
         """Where to connect to."""
@@ -77,10 +78,14 @@ class FoxgloveServer:
             stopping = stop.is_set()  # before the last look, so that it misses nothing
             for message in self.outbox.take(POLL_S):
                 for record in self._converter.records(message):
-                    topics[record.topic].log(record.data, log_time=record.log_ns)
+                    topic = topics.get(record.topic)
+                    if topic is None:
+                        self.unknown += 1
+                        continue
+                    topic.log(record.data, log_time=record.log_ns)
                     self.shown += 1
-        for topic in topics.values():
-            topic.close()
+        for one in topics.values():
+            one.close()
 
 
 def make(config: Config, _: Around) -> Sequence[LiveOutput]:

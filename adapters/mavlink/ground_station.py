@@ -149,7 +149,7 @@ class GroundStation:
     ) -> None:
         self._config, self._settings = config, config.ground_station
         self._geoid_m = config.vehicle.geoid_m
-        self._links = [link_of(inputs, name) for name in config.mavlink]
+        self._links = [link_of(inputs, name) for name in config.mavlink if f"mavlink.{name}" in inputs]  # none in a replay
         self._now = now
         self.outbox = Outbox(OUTBOX, (StateMessage, HealthMessage, EventMessage))
         self._open = self._opener()

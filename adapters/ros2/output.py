@@ -54,14 +54,14 @@ class Ros2Output:
 
     def session(self, stop: Event) -> None:
         """Open, publish until `stop` is set, close. Raises OutputLost."""
-        section = self._section
+        section, lossless = self._section, self.outbox.patience_s > 0
         zenoh_section = ZenohSection(
             mode=section.mode, listen=section.listen, connect=section.connect, config_file=section.config_file
         )
         try:
             with (
                 open_session(zenoh_section, self._directory) as session,
-                Node(session, section.domain, section.namespace, section.node) as node,
+                Node(session, section.domain, section.namespace, section.node, lossless=lossless) as node,
             ):
                 self._publishers = {name: node.publisher(topic) for name, topic in topics(section)}
                 self._publish(session, stop)

@@ -109,11 +109,13 @@ def _explained(what: str) -> Iterator[None]:
 class ZenohPublisher:
     """Publishes messages of all kinds, and a liveliness token as long as it exists.
 
-    A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared.
+    A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared. With
+    `lossless` it waits for readers that do not keep up (Zenoh leaves those that take nothing for 5 s), and drops nothing.
     """
 
-    def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding) -> None:
+    def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding, *, lossless: bool = False) -> None:
         self.vehicle = vehicle
+        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         self._session, self._encoding = session, encoding
         self._publishers: dict[str, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}  # by key
         self._closed = False
@@ -125,18 +127,22 @@ class ZenohPublisher:
             self._declared = declared.pop_all()
 
     def _declare(self, where: str, kind: str, declared: ExitStack) -> None:
-        encoding, drop = zenoh.Encoding(CONTENT_TYPES[self._encoding]), zenoh.CongestionControl.DROP
+        encoding, congestion = zenoh.Encoding(CONTENT_TYPES[self._encoding]), self._congestion
         publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
         if kind in STREAMS:
             publisher = self._session.declare_publisher(
-                where, encoding=encoding, congestion_control=drop, priority=PRIORITY[kind], express=kind != "innovations"
+                where,
+                encoding=encoding,
+                congestion_control=congestion,
+                priority=PRIORITY[kind],
+                express=kind != "innovations",
             )
         else:
             publisher = zenoh.ext.declare_advanced_publisher(
                 self._session,
                 where,
                 encoding=encoding,
-                congestion_control=drop,
+                congestion_control=congestion,
                 cache=zenoh.ext.CacheConfig(KEPT[kind]),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=TELL_LAST_S),
                 publisher_detection=True,

@@ -34,9 +34,13 @@ class Outbox:
         self.latency = RecentLatencies()  # from the instant of a state to its being taken, or sent directly
         self.at_once: Callable[[StateMessage], bool] | None = None
         """Sends a state in the estimator's thread, and never waits. False: it could not, and the state is queued."""
+        self.patience_s = 0.0
+        """How long `put` may wait for room before it drops the oldest message; 0 in a live run. With patience, `put` queues
+        states too, so that none is lost."""
         self._wants = wants
         self._messages: deque[Message] = deque(maxlen=size)
-        self._filled = Condition()
+        self._stalled = False  # it waited in vain, and nothing has been taken since
+        self._changed = Condition()
         self._now: Callable[[], int] | None = None
         self._on_opened: Callable[[], None] | None = None
 
@@ -45,31 +49,36 @@ class Outbox:
         is open. Latencies are measured by `now`."""
         self._now, self._on_opened = now, on_opened
 
-    def put(self, message: Message) -> None:
-        """Add a message, if it is of a wanted kind. Never waits for the reader."""
+    def put(self, message: Message, *, may_wait: bool = True) -> None:
+        """Add a message, if it is of a wanted kind. Without `patience_s` it never waits for the reader; the reader's own
+        thread must not wait (`may_wait`)."""
         if not isinstance(message, self._wants):
             return
-        with self._filled:
+        with self._changed:
             self.offered += 1
-        if type(message) is StateMessage and (send := self.at_once) and send(message):
+        if type(message) is StateMessage and not self.patience_s and (send := self.at_once) and send(message):
             if self._now:
                 self.latency.add(max(0, self._now() - message.t_ns))
             return
-        with self._filled:
-            self.dropped += len(self._messages) == self._messages.maxlen
+        with self._changed:
+            if may_wait and self.patience_s and self._is_full() and not self._stalled:
+                self._stalled = not self._changed.wait_for(lambda: not self._is_full(), self.patience_s)
+            self.dropped += self._is_full()
             self._messages.append(message)
-            self._filled.notify()
+            self._changed.notify_all()
 
     def take(self, timeout_s: float) -> list[Message]:
         """The messages put since the last time, oldest first; waits up to `timeout_s` for the first. Empty after that."""
         if self._on_opened:
             on_opened, self._on_opened = self._on_opened, None
             on_opened()
-        with self._filled:
+        with self._changed:
             if not self._messages:
-                self._filled.wait(timeout_s)
+                self._changed.wait(timeout_s)
             messages = list(self._messages)
             self._messages.clear()
+            self._stalled = False
+            self._changed.notify_all()
         if self._now:
             now = self._now()
             for message in messages:
@@ -77,10 +86,18 @@ class Outbox:
                     self.latency.add(max(0, now - message.t_ns))
         return messages
 
+    @property
+    def waiting(self) -> int:
+        """Messages that nobody has taken yet."""
+        return len(self._messages)
+
+    def _is_full(self) -> bool:
+        return len(self._messages) == self._messages.maxlen
+
     def rouse(self) -> None:
         """Make a waiting `take` return, for instance because the output should stop."""
-        with self._filled:
-            self._filled.notify_all()
+        with self._changed:
+            self._changed.notify_all()
 
 
 class LiveOutput(Protocol):

@@ -18,7 +18,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "adapters/test_outputs.py": "outputs under the daemon: supervision, isolation, and what is published",
     "adapters/zenoh/test_security.py": "the sample configurations for TLS and access control",
     "app/commands/test_command_line.py": "all commands, by their command lines",
-    "app/commands/test_run.py": "`fusiond run` as a process",
+    "app/commands/test_commands.py": "what every command has in common",
     "app/live/test_live_parts.py": "parts of the live daemon, of adapters and configuration",
     "filter/observations/test_observations.py": "every observation model of the table",
     "filter/test_closed_forms.py": "decisions of the filter against the closed forms of tests/oracles",

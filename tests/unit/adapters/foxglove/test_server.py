@@ -15,7 +15,7 @@ import pytest
 
 from fusiond.config.schema import Foxglove
 from fusiond.messages.codec import encode
-from fusiond.messages.types import EventMessage, StateMessage
+from fusiond.messages.types import EventMessage, InnovationMessage, StateMessage
 from fusiond.units import SECOND
 from fusiond_adapters.foxglove.converter import LOG, POSE, TOPICS, channels
 from tests.helpers.drive import messages, settings
@@ -76,6 +76,17 @@ def test_a_client_gets_the_states_and_events() -> None:
     assert json.loads(got[LOG][1])["message"] == event.text
     assert json.loads(got[POSE][1])["frame_id"] == "local_enu"
     assert server.url is None and server.counts()["records"] >= 5
+
+
+def test_a_topic_that_it_does_not_have_is_counted() -> None:
+    server = server_of()
+    stray = InnovationMessage(vehicle="tested", source="imu0", t_ns=1, t_receive_ns=2, outcome="invalid",
+                              test_ratio=None, innovation=(), variance=())  # fmt: skip
+    with serving(server) as lost:
+        server.outbox.put(stray)
+        server.outbox.put(states()[-1])
+        until(lambda: server.counts()["records"] > 0)
+    assert not lost and server.counts()["unknown topics"] == 1
 
 
 def test_a_taken_port_is_told_and_tried_again() -> None:

@@ -317,7 +317,7 @@ def test_interrupt_ends_with_a_line(replay: Run, monkeypatch: pytest.MonkeyPatch
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fusiond.app.commands.replay", interrupted)
+    monkeypatch.setattr("fusiond.app.commands.replay.replay", interrupted)
     assert replay() == (INTERRUPTED, "", "fusiond: interrupted\n")
 
 
