@@ -11,7 +11,7 @@ Names
     mat_nb          (3, 3) rotation that takes a vector in b to n: vector_n = mat_nb @ vector_b
     velocity_n      a vector resolved in n; velocity is always that of the IMU over ground
     quaternion_nb   (w, x, y, z), unit, body to navigation
-    error           the filter's error state; attitude errors are small rotations in n: mat_nb_true = exp([phi]x) mat_nb
+    error           the filter's error state; attitude errors are small rotations in e: mat_eb_true = exp([phi]x) mat_eb
     innovation      measurement less prediction, d = z - h(x)
     variance        sigma squared; a `sigma` is one standard deviation per axis
 Units
