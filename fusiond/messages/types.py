@@ -50,14 +50,14 @@ class State(Message, frozen=True, kw_only=True):
     roll_deg: Annotated[float, _about("roll [deg], Z-Y-X convention, (-180, 180]")]
     pitch_deg: Annotated[float, _about("pitch [deg], [-90, 90]")]
     yaw_deg: Annotated[float, _about("yaw [deg], clockwise from north, (-180, 180]")]
-    angular_rate_b_rps: Annotated[Triple, _about("angular rate [rad/s] in b, freed of bias")]
+    angular_rate_b_rps: Annotated[Triple, _about("angular rate [rad/s] in b, corrected for bias")]
     acceleration_b_mps2: Annotated[
-        Triple, _about("specific force [m/s^2] in b, freed of bias: (0, 0, -9.8) level and at rest")
+        Triple, _about("specific force [m/s^2] in b, corrected for bias: (0, 0, -9.8) level and at rest")
     ]
     gyro_bias_rps: Annotated[Triple, _about("gyro bias [rad/s] in b")]
     accel_bias_mps2: Annotated[Triple, _about("accelerometer bias [m/s^2] in b")]
     wheel_scale: Annotated[float, _about("fraction by which all wheels read too high: 0.01 is 1 %")]
-    mount_deg: Annotated[tuple[float, float], _about("pitch and yaw [deg] of the IMU against the vehicle")]
+    mount_deg: Annotated[tuple[float, float], _about("mounting pitch and yaw [deg] of the IMU in the vehicle")]
     covariance_position_m2: Annotated[Block, _about("position covariance [m^2] in n, 3 x 3 row by row")]
     covariance_velocity_m2ps2: Annotated[Block, _about("velocity covariance [m^2/s^2] in n, 3 x 3 row by row")]
     covariance_attitude_rad2: Annotated[
@@ -75,14 +75,14 @@ class State(Message, frozen=True, kw_only=True):
 
 
 class StateAtInstant(Message, frozen=True, kw_only=True):
-    """What StateMessage and SettledMessage have in common: their layout."""
+    """The common layout of StateMessage and SettledMessage."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    t_ns: Annotated[int, _about("instant the state is valid for [ns]: Unix time of the receiving host")]
-    mode: Annotated[Mode, _about("how far to trust it: aligning (no state yet), nominal, dead_reckoning, lost")]
+    t_ns: Annotated[int, _about("instant the state is valid for [ns], Unix time of the receiving host")]
+    mode: Annotated[Mode, _about("aligning (no state yet), nominal, dead_reckoning or lost")]
     age_ms: Annotated[
-        float | None, _about("t_ns less the stamp of the last IMU sample behind it [ms]; null before the first")
+        float | None, _about("t_ns less the stamp of the newest IMU sample used [ms]; null before the first")
     ]
     resets: Annotated[int, _about("number of resets, that is jumps of the state")]
     fault: Annotated[str | None, _about("why the state was withheld; null otherwise")] = None
@@ -113,9 +113,9 @@ class InnovationMessage(Message, frozen=True, kw_only=True):
     t_ns: Annotated[int, _about("instant of the measurement, aligned [ns]")]
     t_receive_ns: Annotated[int, _about("when it was received [ns]")]
     outcome: Annotated[OutcomeName, _about("its outcome, which a late measurement of another source can still change")]
-    test_ratio: Annotated[float | None, _about("squared innovation over its limit, 1 at the gate; null if not judged")]
+    test_ratio: Annotated[float | None, _about("squared innovation over its limit, 1 at the gate; null if not tested")]
     innovation: Annotated[
-        tuple[float, ...], _about("measurement less prediction, in the measurement's unit; empty if not judged")
+        tuple[float, ...], _about("measurement less prediction, in the measurement's unit; empty if not tested")
     ]
     variance: Annotated[tuple[float, ...], _about("variances that the filter expects of the innovation, per axis")]
     reason: Annotated[str | None, _about("why it is invalid; null otherwise")] = None
@@ -152,11 +152,11 @@ class LatencyHealth(Message, frozen=True, kw_only=True):
 
 
 class ClockHealth(Message, frozen=True, kw_only=True):
-    """How the clock that a source stamps with is placed on the time line."""
+    """Alignment of the clock that a source stamps with."""
 
-    name: Annotated[str, _about("the clock: unix, <link>/<system>/boot, or arrival where there is no stamp")]
+    name: Annotated[str, _about("the clock: unix, <link>/<system>/boot, or arrival if there is no stamp")]
     method: Annotated[str, _about("unix, timesync, system_time, least_offset or arrival")]
-    offset_ms: Annotated[float, _about("time line less the clock's stamp [ms]")]
+    offset_ms: Annotated[float, _about("common time line less the clock's stamp [ms]")]
     drift_ppm: Annotated[float, _about("how much faster the host's clock runs")]
     jitter_ms: Annotated[float, _about("mean of receipt less aligned stamp since the last re-alignment [ms]")]
     resets: Annotated[int, _about("re-alignments after a jump or a reboot")]
@@ -181,7 +181,7 @@ class SourceHealth(Message, frozen=True, kw_only=True):
     present: Annotated[bool, _about("whether anything was received from it in the last 2 s")]
     age_ms: Annotated[float | None, _about("since its last receipt [ms]; null before the first")] = None
     rate_hz: Annotated[float, _about("receipts per second, recently")] = 0.0
-    test_ratio: Annotated[float | None, _about("of its last measurement, 1 at the gate; null if none was judged")] = None
+    test_ratio: Annotated[float | None, _about("of its last measurement, 1 at the gate; null if none was tested")] = None
     nis_mean: Annotated[
         float | None, _about("mean over the horizon of the squared innovations per axis, in sigmas: 1 is as expected")
     ] = None
@@ -214,7 +214,7 @@ class OutputHealth(Message, frozen=True, kw_only=True):
 class Calibration(Message, frozen=True, kw_only=True):
     """A parameter of the installation that is learnt."""
 
-    value: Annotated[float, _about("as learnt so far, in the unit that its name ends in")]
+    value: Annotated[float, _about("correction to the configured value, in the unit that its name ends in")]
     sigma: Annotated[float, _about("one standard deviation of it")]
 
 
