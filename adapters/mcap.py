@@ -2,7 +2,7 @@
 
     python -m fusiond_adapters.mcap CUT.mcap WHOLE.mcap
 
-writes what is whole of a file that was cut off (power, full disk) into a file with an index. Needs the extra `mcap`.
+copies the intact part of a file that was cut off (power, full disk) into a file with an index. Needs the extra `mcap`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from fusiond import __version__
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.messages.info import config_table
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.units import SECOND
 from fusiond_adapters.foxglove.converter import SHOWN, Channel, Converter, Record, channels
-from fusiond_adapters.logs.black_box import FLUSH_S, MEGABYTE, file_name, make_room
+from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, file_name, make_room, name_pattern
 
 try:
     from mcap import records
@@ -36,12 +37,11 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("MCAP files need the extra mcap: pip install 'fusiond[mcap]'") from missing
 
-SECOND = 1_000_000_000  # ns
-CHUNK_BYTES = 1 << 20  # a chunk ends here at the latest
+CHUNK_BYTES = 1 << 20  # largest chunk
 LIBRARY = f"fusiond {__version__}"
 KIND = "fusion.mcap"
-NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-fusion\.mcap")  # nothing else in the folder is ever removed
-MOST_WAITING = 4096  # messages between the estimator and the disk
+NAME = name_pattern(re.escape(KIND))  # nothing else in the folder is ever removed
+MAX_WAITING = 4096  # messages between the estimator and the disk
 
 
 class McapFile:
@@ -52,6 +52,7 @@ class McapFile:
     def __init__(self, path: Path, config: Config) -> None:
         self.written = 0  # records that have left for the disk
         self.waiting = 0  # records of the chunk that is being gathered
+        self.unknown = 0  # records of topics that the file does not have; they are left out
         self._path, self._out = path, _Out(path)
         self._writer = Writer(self._out, chunk_size=CHUNK_BYTES)
         self._writer.start(library=LIBRARY)
@@ -65,13 +66,17 @@ class McapFile:
         return self._out.written
 
     def add(self, record: Record) -> None:
-        """Write a record, behind those before it."""
+        """Append a record."""
+        channel = self._channels.get(record.topic)
+        if channel is None:
+            self.unknown += 1
+            return
         second = record.publish_ns // SECOND
         if second != self._second:
             self.flush()
             self._second = second
         self.waiting += 1
-        self._writer.add_message(self._channels[record.topic], record.log_ns, record.data, record.publish_ns)
+        self._writer.add_message(channel, record.log_ns, record.data, record.publish_ns)
 
     def flush(self) -> None:
         """End the chunk, so that what was added survives a crash of this process."""
@@ -88,7 +93,8 @@ class McapFile:
             self._out.close()
 
     def abandon(self) -> None:
-        """After an OSError: leave what was written whole, or no file. The index is missing, see `repair`. Raises OSError."""
+        """After an OSError: keep the complete chunks, or remove an empty file. The index is missing, see `repair`. Raises
+        OSError."""
         self._out.cut()
         if not self.size:
             self._path.unlink(missing_ok=True)
@@ -111,7 +117,7 @@ class McapFile:
 
 
 class _Out:
-    """Gathers what the writer writes, and hands it to the file whole, so that a full disk leaves no half of it behind."""
+    """Collects the writer's bytes and writes them in whole chunks, so that a full disk leaves no part of one behind."""
 
     def __init__(self, path: Path) -> None:
         self.written = 0
@@ -161,13 +167,13 @@ def _registered(writer: Writer, channel: Channel) -> int:
 
 
 class McapRecorder:
-    """The live output: files of bounded size in a folder, the oldest of which go in time."""
+    """The live output: files of bounded size in a folder, of which the oldest are removed."""
 
     name = "mcap"
 
     def __init__(self, config: Config, folder: Path) -> None:
         self.about = f"MCAP files in {folder}"
-        self.outbox = Outbox(MOST_WAITING, SHOWN)
+        self.outbox = Outbox(MAX_WAITING, SHOWN)
         self.lost = self.files = 0
         self._folder, self._config = folder, config
         section = config.mcap
@@ -178,7 +184,7 @@ class McapRecorder:
         self._chunk = 0  # largest so far [bytes]
 
     def session(self, stop: Event) -> None:
-        """Write until told to stop. Raises OutputLost."""
+        """Write until `stop` is set. Raises OutputLost."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._run(stop)
@@ -186,10 +192,10 @@ class McapRecorder:
             raise OutputLost(f"{error.filename or self._folder}: {error.strerror}") from error
 
     def counts(self) -> dict[str, int]:
-        """Records and files."""
+        """Records, those lost or of a topic that the files do not have, and files."""
         file = self._file
-        written = self._ended + (file.written if file else 0)
-        return {"records": written, "records lost": self.lost, "files": self.files}
+        written, unknown = (file.written, file.unknown) if file else (0, 0)
+        return {"records": self._ended + written, "records lost": self.lost + unknown, "files": self.files}
 
     def notes(self) -> dict[str, str]:
         """Where the files are."""
@@ -233,14 +239,21 @@ class McapRecorder:
             how(self._file)
             file, self._file = self._file, None
             self._ended += file.written
+            self.lost += file.unknown
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration with a folder for it."""
+    assert config.mcap.folder is not None
+    return [McapRecorder(config, config.path(config.mcap.folder))]
 
 
 # --- Repair
 
 
 def repair(cut: Path, whole: Path) -> tuple[int, str | None]:
-    """Write what is whole of a file into another: the number of messages, and what ended the reading, if it was not the
-    end of the messages. Raises OSError."""
+    """Copy the intact part of a file into another. Returns the number of messages, and why reading stopped early, if it did.
+    Raises OSError."""
     messages, ids, reason = 0, dict[int, int](), None
     with cut.open("rb") as source, whole.open("wb") as target:
         writer = Writer(target, chunk_size=CHUNK_BYTES)

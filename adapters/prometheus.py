@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from threading import Event
 from typing import Any
 
@@ -13,7 +13,8 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.units import SECOND
 
 try:
     from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
@@ -22,7 +23,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[prometheus] needs the extra prometheus: pip install 'fusiond[prometheus]'") from missing
 
-MOST_WAITING = 4096  # messages between the estimator and the counting
+MAX_WAITING = 4096  # messages between the estimator and the counting
 RATIO_BUCKETS = (0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 2.0, 5.0, 10.0, 100.0)
 DELAY_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s
 QUANTILES = {"p50": "0.5", "p90": "0.9", "p99": "0.99", "max": "1"}
@@ -31,14 +32,14 @@ Metrics = Iterator[Any]
 
 
 class PrometheusServer:
-    """The live output. What a scrape tells is as of the latest messages."""
+    """The live output. A scrape shows the latest messages."""
 
     name = "prometheus"
 
     def __init__(self, config: Config) -> None:
         self._section = config.prometheus
         self.about = f"Prometheus metrics on {self._section.host}:{self._section.port}"
-        self.outbox = Outbox(MOST_WAITING, (StateMessage, HealthMessage, InnovationMessage))
+        self.outbox = Outbox(MAX_WAITING, (StateMessage, HealthMessage, InnovationMessage))
         self.url: str | None = None  # while it runs
         self._registry = CollectorRegistry()
         self._latest = Latest()
@@ -54,7 +55,7 @@ class PrometheusServer:
         )  # fmt: skip
 
     def session(self, stop: Event) -> None:
-        """Serve until told to stop. Raises OutputLost."""
+        """Serve until `stop` is set. Raises OutputLost."""
         try:
             server, thread = start_http_server(self._section.port, self._section.host, registry=self._registry)
         except OSError as error:
@@ -86,9 +87,14 @@ class PrometheusServer:
         elif isinstance(message, HealthMessage):
             self._latest.health = message
         elif isinstance(message, InnovationMessage):
-            self._delays.labels(message.source).observe((message.t_receive_ns - message.t_ns) / 1e9)
+            self._delays.labels(message.source).observe((message.t_receive_ns - message.t_ns) / SECOND)
             if message.test_ratio is not None:
                 self._ratios.labels(message.source).observe(message.test_ratio)
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [PrometheusServer(config)]
 
 
 class Latest(Collector):  # type: ignore[misc]  # Any, where the extra is missing
@@ -114,7 +120,7 @@ class Latest(Collector):  # type: ignore[misc]  # Any, where the extra is missin
 
 
 def _of_state(message: StateMessage) -> Metrics:
-    yield _gauge("time_seconds", "Unix time that the state is valid for", {(): message.t_ns / 1e9})
+    yield _gauge("time_seconds", "Unix time that the state is valid for", {(): message.t_ns / SECOND})
     modes = {(mode.value,): float(mode is message.mode) for mode in Mode}
     yield _gauge("mode", "1 for the present mode", modes, ["mode"])
     if message.age_ms is not None:

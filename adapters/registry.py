@@ -1,81 +1,69 @@
-"""Every output there is: a factory each, which makes none, one or several of them, as the configuration asks.
+"""Every input, every output and every log format, one line each.
 
-A factory imports its adapter only when the configuration asks for it, so that nobody pays for what is off.
+A line names a module of fusiond_adapters. It is imported only when the configuration asks for it, so nobody waits for the
+import of what is off. A module of an input or an output has a function `make`, which gives one or several adapters; that
+of a log format has `open_log`, see `logs.format`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from typing import Any
 
 from fusiond.config.schema import Config
-from fusiond.ports.outputs import Around, Factory, LiveOutput
+from fusiond.ports.inputs import LiveInput, Receiver
+from fusiond.ports.outputs import Around, LiveOutput
+from fusiond_adapters.logs.format import LogFormat
+
+INPUTS: Mapping[str, str] = {  # section of the configuration: module
+    "mavlink": "mavlink.link",
+    "can": "can.bus",
+}
+OUTPUTS: Mapping[str, Callable[[Config], bool]] = {  # module: whether the configuration asks for it
+    "zenoh.output": lambda config: True,  # other programs of fusiond read it there
+    "ros2.output": lambda config: config.ros2.enabled,
+    "mcap": lambda config: config.mcap.folder is not None,
+    "foxglove.server": lambda config: config.foxglove.enabled,
+    "prometheus": lambda config: config.prometheus.enabled,
+    "mavlink.outputs": lambda config: _mavlink_outputs(config) != {None},
+}
+LOG_FORMATS = (
+    LogFormat(".tlog", "MAVLink", "logs.tlog"),
+    LogFormat(".log", "candump -L", "logs.candump"),
+    LogFormat(".asc", "Vector ASC", "logs.python_can"),
+    LogFormat(".blf", "Vector BLF", "logs.python_can"),
+    LogFormat(".trc", "PEAK TRC", "logs.python_can"),
+    LogFormat(".csv", "python-can CSV", "logs.python_can"),
+    LogFormat(".db", "python-can SQLite", "logs.python_can", zipped=False),
+    LogFormat(".mf4", "ASAM MDF 4", "logs.python_can", zipped=False),
+)
 
 
-def zenoh(config: Config, _: Around) -> Sequence[LiveOutput]:
-    """[zenoh]: always there, as everything else that reads fusiond reads it there."""
-    from fusiond_adapters.zenoh.output import ZenohOutput  # noqa: PLC0415
-
-    return [ZenohOutput(config)]
+def _mavlink_outputs(config: Config) -> set[str | None]:
+    """Where the outputs over MAVLink send."""
+    return {config.autopilot.link, config.ground_station.link, config.ground_station.connection}
 
 
-def ros2(config: Config, _: Around) -> Sequence[LiveOutput]:
-    """[ros2], where enabled."""
-    if not config.ros2.enabled:
-        return []
-    from fusiond_adapters.ros2.output import Ros2Output  # noqa: PLC0415
-
-    return [Ros2Output(config)]
-
-
-def mcap(config: Config, _: Around) -> Sequence[LiveOutput]:
-    """[mcap], where it has a folder."""
-    if config.mcap.folder is None:
-        return []
-    from fusiond_adapters.mcap import McapRecorder  # noqa: PLC0415
-
-    return [McapRecorder(config, config.path(config.mcap.folder))]
-
-
-def foxglove(config: Config, _: Around) -> Sequence[LiveOutput]:
-    """[foxglove], where enabled."""
-    if not config.foxglove.enabled:
-        return []
-    from fusiond_adapters.foxglove.server import FoxgloveServer  # noqa: PLC0415
-
-    return [FoxgloveServer(config)]
-
-
-def prometheus(config: Config, _: Around) -> Sequence[LiveOutput]:
-    """[prometheus], where enabled."""
-    if not config.prometheus.enabled:
-        return []
-    from fusiond_adapters.prometheus import PrometheusServer  # noqa: PLC0415
-
-    return [PrometheusServer(config)]
-
-
-def mavlink(config: Config, around: Around) -> Sequence[LiveOutput]:
-    """[autopilot] and [ground_station], where they have a link or a connection; the latter offers the former's rate."""
-    made: list[LiveOutput] = []
-    parameters = []
-    now = around.clock.now_ns
-    if config.autopilot.link is not None:
-        from fusiond_adapters.mavlink.autopilot import AutopilotOutput  # noqa: PLC0415
-        from fusiond_adapters.mavlink.link import link_of  # noqa: PLC0415
-
-        autopilot = AutopilotOutput(config, link_of(around.inputs, config.autopilot.link), now)
-        parameters = [autopilot.parameter()]
-        made.append(autopilot)
-    if config.ground_station.link is not None or config.ground_station.connection is not None:
-        from fusiond_adapters.mavlink.ground_station import GroundStation  # noqa: PLC0415
-
-        made.append(GroundStation(config, around.inputs, now, parameters))
+def make_inputs(config: Config, receiver: Receiver) -> dict[str, LiveInput[Any]]:
+    """The inputs of a configuration, by section and name, such as mavlink.fc. Raises ConfigError."""
+    made: dict[str, LiveInput[Any]] = {}
+    for section, module in INPUTS.items():
+        if getattr(config, section):
+            inputs: Sequence[LiveInput[Any]] = _make(module, config, receiver)
+            made |= {f"{section}.{one.name}": one for one in inputs}
     return made
 
 
-OUTPUTS: tuple[Factory, ...] = (zenoh, ros2, mcap, foxglove, prometheus, mavlink)
-
-
 def make_outputs(config: Config, around: Around) -> dict[str, LiveOutput]:
-    """The outputs of a configuration, by name. Raises ConfigError."""
-    return {output.name: output for factory in OUTPUTS for output in factory(config, around)}
+    """The outputs of a configuration, by name. Raises ConfigError, also where an extra is missing."""
+    made: dict[str, LiveOutput] = {}
+    for module, wanted in OUTPUTS.items():
+        if wanted(config):
+            outputs: Sequence[LiveOutput] = _make(module, config, around)
+            made |= {one.name: one for one in outputs}
+    return made
+
+
+def _make(module: str, *arguments: object) -> Any:
+    return import_module(f"fusiond_adapters.{module}").make(*arguments)

@@ -23,7 +23,8 @@ import msgspec
 import zenoh
 
 from benchmarks.latency import configuration, free_port, process, turn_wheels
-from fusiond.app.live.daemon import Daemon, serve
+from fusiond.app.live.daemon import Daemon
+from fusiond.app.live.serve import serve
 from fusiond.config.schema import Config, Mcap
 from fusiond.messages.latency import RecentLatencies
 

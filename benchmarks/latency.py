@@ -42,7 +42,8 @@ from pymavlink.dialects.v20 import common
 
 from fusiond import __version__
 from fusiond.app.client import Client
-from fusiond.app.live.daemon import Daemon, serve
+from fusiond.app.live.daemon import Daemon
+from fusiond.app.live.serve import serve
 from fusiond.config import load as config
 from fusiond.config.schema import Config, Zenoh
 from fusiond.messages.types import StateMessage
@@ -293,9 +294,10 @@ def watch_stages(daemon: Daemon, meter: Meter) -> None:
         meter.watch(source, "decode", f"decode {source.name}")
         meter.watch(source, "record", "black box")
     meter.watch(live, "record", "black box")
-    meter.watch(live.engine, "take", "align and fuse")
+    meter.watch(live.engine.fusion, "receive", "align and fuse")
     meter.watch(live.engine, "message", "predict and make the state message")
-    meter.watch(live.publication, "health", "health")
+    assert live.engine.publication is not None
+    meter.watch(live.engine.publication, "health", "health")
     meter.watch(live, "step", "the rest of a step: order, ticks, settled, innovations, hand-over")
 
 

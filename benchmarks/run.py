@@ -44,11 +44,14 @@ COURSE = [  # one round of the simulated course: duration [s], speed at its end 
     (15, 9, 60), (10, 0, 0), (10, 0, 0), (20, 15, 0), (20, 0, -60),
 ]  # fmt: skip
 
+# Of memory the kernel's own high-water mark: ru_maxrss of a child begins at what its parent used.
 TELL_USAGE = """
 import atexit, resource
 def tell():
     used = resource.getrusage(resource.RUSAGE_SELF)
-    print("USED", used.ru_utime + used.ru_stime, used.ru_maxrss)
+    with open("/proc/self/status") as status:
+        peak_kb = next(line.split()[1] for line in status if line.startswith("VmHWM"))
+    print("USED", used.ru_utime + used.ru_stime, peak_kb)
 atexit.register(tell)
 """
 READ_MAVLINK = """
@@ -304,7 +307,7 @@ def start_lines(repeats: int) -> list[Line]:
     lines = []
     for what, code in (
         ("import the core (fusiond.estimator.fusion)", "import fusiond.estimator.fusion"),
-        ("import all of replay", "import fusiond.app.replay.replay"),
+        ("import all of replay", "import fusiond.app.replay.job"),
         ("fusiond --version", "import fusiond.__main__ as m\ntry: m.main(['--version'])\nexcept SystemExit: pass"),
     ):
         seconds = statistics.median(run_python("-c", code)[0] for _ in range(repeats))

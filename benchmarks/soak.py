@@ -29,7 +29,8 @@ from benchmarks.latency import CAN_HZ, IMU_HZ, configuration, free_port, process
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config.schema import Config
-from fusiond.messages.types import StateMessage, encode
+from fusiond.messages.codec import encode
+from fusiond.messages.types import StateMessage
 from fusiond_adapters.can.bus import CanFrame
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.play import PlayedClock

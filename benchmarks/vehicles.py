@@ -25,6 +25,7 @@ import numpy as np
 from fusiond.app.client import Client
 from fusiond.config.schema import Zenoh
 from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import (
     EventMessage,
     HealthMessage,
@@ -34,7 +35,6 @@ from fusiond.messages.types import (
     OutcomeCounts,
     SourceHealth,
     StateMessage,
-    state_message,
 )
 from fusiond_adapters.zenoh.session import KIND, ZenohPublisher, open_session
 

@@ -1,4 +1,4 @@
-"""How long GNSS speed lags behind wheel speed: python gnss_lag.py car.toml drive.tlog drive.log"""
+"""Estimate how much GNSS speed lags behind wheel speed: python gnss_lag.py car.toml drive.tlog drive.log"""
 
 import sys
 

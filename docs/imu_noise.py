@@ -1,13 +1,13 @@
 """Noise densities of the inertial sensor in a log, vibration included: python imu_noise.py car.toml drive.tlog [START-STOP]
 
-Of the seconds START to STOP, the differences of successive samples: what changes slowly, as driving does, drops out.
+It uses the differences of successive samples in the seconds START to STOP, so slow changes, such as driving, cancel.
 """
 
 import sys
 
 import numpy as np
 
-from fusiond.app.replay.replay import parse_interval
+from fusiond.app.replay.intervals import parse_interval
 from fusiond.config import load as config
 from fusiond.events import ImuSample
 from fusiond.timeline.clock import Clock

@@ -41,7 +41,7 @@ class Table(NamedTuple):
 
 
 def page(name: str, text: str) -> str:
-    """The text of a page, its tables made anew."""
+    """The text of a page with its tables regenerated."""
     root, omitted = PAGES[name]
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)

@@ -1,6 +1,6 @@
 """Draw the pictures of the documentation into docs/images/: python docs/make_pictures.py [NAME ...] (needs the extra `plot`)
 
-The picture of the captured drive needs that drive in ../shared/data, beside the project; without it, it is left out.
+The picture of the captured drive needs that drive in ../shared/data, beside the project; without it, it is skipped.
 """
 
 import csv
@@ -21,7 +21,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from fusiond.app.demo import demo
 from fusiond.app.replay.comparison import Truth, Window, displacement, parse_truth
-from fusiond.app.replay.replay import Options, Replay, Wants, replay
+from fusiond.app.replay.job import Options, replay
+from fusiond.app.replay.replay import Replay, Wants
 from fusiond.app.replay.summary import Summary
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config
@@ -73,7 +74,7 @@ def draw_demo() -> None:
 
 
 class Errors(NamedTuple):
-    """Of a replay against the reference, one row per publication."""
+    """Errors of a replay against the reference, one value per publication."""
 
     second: list[float]
     along_m: list[float]  # in the direction of travel
@@ -83,7 +84,7 @@ class Errors(NamedTuple):
 def draw_arrival() -> None:
     """What it costs to fuse each fix at its arrival."""
     if not DRIVE.is_dir():
-        print("arrival.png left out: the captured drive is not beside the project", file=sys.stderr)
+        print("arrival.png skipped: the captured drive is not beside the project", file=sys.stderr)
         return
     text = CAR.read_text(encoding="utf-8")
     learnt = re.compile(r"^(velocity_)?delay_sigma_ms = .*\n", re.MULTILINE)
@@ -94,9 +95,9 @@ def draw_arrival() -> None:
     for label, colour, settings in runs:
         summary, errors = fused(settings)
         assert summary.truth is not None
-        told = f"{label}: {summary.truth.position.rmse_m:.2f} m RMSE"
-        print(f"{told}, {summary.truth.velocity_rmse_mps:.3f} m/s, {100 * summary.truth.position.inside_95:.0f} % inside")
-        axes[0].plot(errors.second, errors.along_m, color=colour, linewidth=1.2, label=told)
+        result = f"{label}: {summary.truth.position.rmse_m:.2f} m RMSE"
+        print(f"{result}, {summary.truth.velocity_rmse_mps:.3f} m/s, {100 * summary.truth.position.inside_95:.0f} % inside")
+        axes[0].plot(errors.second, errors.along_m, color=colour, linewidth=1.2, label=result)
         axes[1].plot(errors.second, errors.across_m, color=colour, linewidth=1.2)
     for ax, name in zip(axes, ("along the track [m]", "across the track [m]"), strict=True):
         ax.axhline(0.0, color=GREY, linewidth=0.6)
@@ -157,7 +158,7 @@ def draw_rewind() -> None:
     figure = figure_of(9, 3.6)
     axes = figure.subplots(2, 1, sharex=True)
     imu = np.arange(0, END_MS, STEP_MS)
-    for ax, title in zip(axes, ("1  a fix arrives at 112 ms: it tells of the instant 34 ms", "2  back to the snapshot"
+    for ax, title in zip(axes, ("1  a fix arrives at 112 ms; it was measured at 34 ms", "2  back to the snapshot"
                          " at 0 ms, forward again, fix included, up to the newest IMU sample"), strict=True):  # fmt: skip
         ax.set_title(title, loc="left", fontsize=10)
         ax.plot(imu, np.zeros(len(imu)), "o", color=GREY, markersize=5)
@@ -176,7 +177,7 @@ def draw_rewind() -> None:
         arrow(axes[1], (begin, 1.45), (end, 1.45), BLUE)
     axes[1].annotate("the interval 30 to 40 ms is split at the fix", (FIX_MS, 1.1), (FIX_MS + 4, 1.0), fontsize=8)
     axes[0].annotate("snapshot", (SNAPSHOTS_MS[1], 1.5), (SNAPSHOTS_MS[1] + 1.2, 1.4), fontsize=8, color=BLUE)
-    axes[1].set_xlabel("the instants that the events tell of [ms]")
+    axes[1].set_xlabel("time of measurement [ms]")
     path = IMAGES / "rewind.png"
     figure.savefig(path)
     shrink(path)
@@ -187,7 +188,7 @@ def arrow(ax: Axes, tail: tuple[float, float], head: tuple[float, float], colour
     ax.annotate("", head, tail, arrowprops=look)
 
 
-# --- Simulated drives: the heading bank choosing, a slip being named
+# --- Simulated drives: the heading bank at work, a slip that is detected
 
 REVERSES = """
 truth_rate_hz = 20
@@ -227,7 +228,7 @@ factor = 1.3
 
 
 class Seen(NamedTuple):
-    """What was looked at in a drive: at each publication the second, and what of interest there was."""
+    """Samples of a drive, one for each publication."""
 
     second: list[float]
     looks: list[tuple[float, ...]]
@@ -235,7 +236,7 @@ class Seen(NamedTuple):
 
 
 def seen(scenario: str, look: Callable[[Replay, StateMessage], tuple[float, ...]]) -> Seen:
-    """Simulate a drive, fuse it, and take a look at every publication."""
+    """Simulate a drive, fuse it, and sample it at every publication."""
     second: list[float] = []
     looks: list[tuple[float, ...]] = []
     with tempfile.TemporaryDirectory() as name:
@@ -260,7 +261,7 @@ def draw_bank() -> None:
     """How the heading is found: a vehicle that reverses out of its parking place."""
 
     def look(run: Replay, message: StateMessage) -> tuple[float, ...]:
-        """The one yaw and its sigma; before that not a number, and weight and yaw of each hypothesis that is left."""
+        """Yaw and sigma; before there is a state, NaN, and weight and yaw of each remaining hypothesis."""
         head, kernel = run.fusion.history.head, run.fusion.history.kernel
         if message.state:
             return message.state.yaw_deg % 360, message.state.sigma_yaw_deg
@@ -278,20 +279,20 @@ def draw_bank() -> None:
     top.fill_between(t, yaw - 3 * sigma, yaw + 3 * sigma, color=GREEN, alpha=0.25, linewidth=0)
     top.plot(t, yaw, color=GREEN, label="the filter runs (band: 3 sigma)")
     top.plot(truth["second"], np.array(truth["yaw_deg"]) % 360, "--", color=VERMILION, linewidth=1.2, label="true heading")
-    top.scatter([], [], s=40, color=BLUE, label="hypotheses, as large as their weight")
+    top.scatter([], [], s=40, color=BLUE, label="hypotheses, size by weight")
     top.set(ylabel="heading [deg]", ylim=(0, 360), yticks=range(0, 361, 60))
     top.legend(loc="upper right", frameon=False, fontsize=8)
-    top.set_title("Start without a heading, in reverse; the wheels do not tell the direction", loc="left", fontsize=10)
+    top.set_title("Start without a heading, in reverse, with wheels that do not measure direction", loc="left", fontsize=10)
     bottom.plot(truth["second"], -np.hypot(truth["vn_mps"], truth["ve_mps"]), color=GREY)
     bottom.set(ylabel="speed [m/s]", xlabel="time [s]", xlim=(0, second[-1]))
     save(figure, "bank.png")
 
 
 def draw_slip() -> None:
-    """How a wheel that slips is named and dropped."""
+    """How a wheel that slips is detected and not fused."""
 
     def look(run: Replay, message: StateMessage) -> tuple[float, ...]:
-        """Speed as estimated and as the wheel has it, and what the wheel is held to be."""
+        """Estimated speed, the wheel's speed, and the probabilities of the wheel's health."""
         head, history = run.fusion.history.head, run.fusion.history
         wheel = float(head.memory[history.index["rear_left"], LAST_VALUE])
         speed = math.hypot(*message.state.velocity_ned_mps[:2]) if message.state else math.nan
@@ -309,7 +310,7 @@ def draw_slip() -> None:
     top.set_title("A wheel spins 30 % too fast from 15 s to 20 s", loc="left", fontsize=10)
     colours = (GREEN, BLUE, VERMILION, ORANGE, GREY)
     bottom.stackplot(second, *beliefs, colors=colours, labels=STATUSES, alpha=0.8, linewidth=0)
-    bottom.set(ylabel="what it is held to be", xlabel="time [s]", xlim=(12, 24), ylim=(0, 1))
+    bottom.set(ylabel="probability", xlabel="time [s]", xlim=(12, 24), ylim=(0, 1))
     bottom.legend(loc="center left", framealpha=0.9, fontsize=8)
     save(figure, "slip.png")
 

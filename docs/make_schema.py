@@ -7,7 +7,8 @@ from typing import Any
 
 import msgspec
 
-from fusiond.messages.types import MESSAGES, schemas
+from fusiond.messages.codec import schemas
+from fusiond.messages.types import MESSAGES
 
 FOLDER = Path(__file__).parent / "schema"
 PAGE = Path(__file__).parent / "messages.md"

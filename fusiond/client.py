@@ -1,4 +1,4 @@
-"""For programs that read fusiond: see `fusiond.app.client`, whose public names are these."""
+"""The client for programs that read fusiond; `fusiond.app.client` has the implementation."""
 
 from __future__ import annotations
 

@@ -1,28 +1,31 @@
-"""CAN live: one bus's frames, what is made of them, and what its error frames tell.
+"""The live input of one CAN bus: its frames decoded, its error frames counted.
 
-python-can and cantools are slow to import, and so only `prepare` does, in the input's thread: after a restart the other
-inputs are fused again, and the state is published, without waiting for them.
+python-can and cantools are slow to import. Only `prepare` imports them, in the input's thread, so that after a restart
+the other inputs are fused and the state is published without waiting.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
+from operator import attrgetter
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
-from fusiond.ports.inputs import Inbox
+from fusiond.ports.clock import Clock
+from fusiond.ports.inputs import Inbox, LiveInput, Receiver
+from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.can.kernel_socket import CanFrame
-from fusiond_adapters.host.clock import HostClock
 
 if TYPE_CHECKING:
     from fusiond_adapters.can.decoder import CanDecoder
     from fusiond_adapters.can.driver import CanDriver
 
 CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100  # classes of error frames, linux/can/error.h
-OVERFLOW, WARNING, PASSIVE, ACTIVE = 0x03, 0x0C, 0x30, 0x40  # what byte 1 says of the controller
+OVERFLOW, WARNING, PASSIVE, ACTIVE = 0x03, 0x0C, 0x30, 0x40  # byte 1: state of the controller
 ERROR_FLAG = 0x20000000  # in an id as candump writes it
 
 log = logging.getLogger("fusiond")
@@ -31,7 +34,7 @@ log = logging.getLogger("fusiond")
 class CanBus:
     """One [can.NAME]."""
 
-    def __init__(self, config: Config, bus: str, inbox: Inbox[CanFrame], clock: HostClock) -> None:
+    def __init__(self, config: Config, bus: str, inbox: Inbox[CanFrame], clock: Clock) -> None:
         self.name = bus
         self.file = "can.log"
         self.inbox = inbox
@@ -45,7 +48,7 @@ class CanBus:
         self.configure(config)
 
     def configure(self, config: Config) -> None:
-        """Take interface and channel of a configuration, for the sessions to come."""
+        """Use interface and channel of a configuration from the next session on."""
         settings = self._settings = config.can[self.name]
         where = " ".join(filter(None, (settings.interface, settings.channel, settings.config_context)))
         self.about = f"CAN {self.name} ({where or 'as python-can is configured'})"
@@ -59,7 +62,7 @@ class CanBus:
         self._driver = CanDriver(self.decoder, self.inbox, self._clock)
 
     def session(self, stop: Event) -> None:
-        """Open the bus, read it until told to stop, close it. Raises InputLost."""
+        """Open the bus, read it until `stop` is set, close it. Raises InputLost."""
         assert self._driver is not None
         with self._driver.opened(self._settings) as bus:
             self.sessions += 1
@@ -67,14 +70,14 @@ class CanBus:
             self._driver.read(bus, stop)
 
     def decode(self, item: CanFrame, t_ns: int) -> list[Received]:
-        """The wheels in a frame; an error frame has none, and is counted."""
+        """The wheel speeds in a frame. An error frame has none and is counted."""
         if item.is_error:
             self._take_error(item)
             return []
         if item.is_remote:
             self._seen["remote frames"] += 1
             return []
-        assert self.decoder is not None  # no frame comes before
+        assert self.decoder is not None  # frames come only after prepare
         return self.decoder.decode(item.arbitration_id, item.is_extended, item.data, t_ns)
 
     def _take_error(self, item: CanFrame) -> None:
@@ -107,12 +110,22 @@ class CanBus:
         number = item.arbitration_id | (ERROR_FLAG if item.is_error else 0)
         wide = item.is_extended or item.is_error
         marks = "#R" if item.is_remote else "#" if item.fd_flags is None else f"##{item.fd_flags:X}"
-        seconds, rest = divmod(t_ns, 10**9)
-        stamp = f"({seconds}.{rest // 1000:06d})"
+        seconds, rest = divmod(t_ns, SECOND)
+        stamp = f"({seconds}.{rest // MICROSECOND:06d})"
         return f"{stamp} {self._channel} {number:0{8 if wide else 3}X}{marks}{item.data.hex().upper()}\n".encode()
 
     def counts(self) -> dict[str, int]:
-        """What became of the frames so far, and of the bus."""
+        """Counts of frames and of errors of the bus so far."""
         own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
         decoded = self.decoder.counts if self.decoder else {}
         return {**own, **{name: count for name, count in self._seen.items() if count}, **decoded}
+
+
+def make(config: Config, receiver: Receiver) -> Sequence[LiveInput[Any]]:
+    """The bus of each [can.NAME]."""
+
+    def bus(name: str) -> CanBus:
+        inbox = Inbox(config.live.queue_frames, receiver.wake, attrgetter("arbitration_id"))
+        return CanBus(config, name, inbox, receiver.clock)
+
+    return [bus(name) for name in config.can]

@@ -1,4 +1,4 @@
-"""Checksums of car makers' CAN frames: is that of a frame right? They are known by the work on opendbc."""
+"""Checksums in the CAN frames of car makers, as opendbc documents them."""
 
 from __future__ import annotations
 

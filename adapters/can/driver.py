@@ -1,9 +1,9 @@
 """python-can: opens a bus, and reads it into an inbox.
 
-The bus is opened by python-can's own configuration (files, environment, `config_context`); what [can.NAME] gives goes
-first. Where the interface can filter, only frames of the wheels' ids, and error frames, come in. The kernel's stamp of
-a frame is mapped to the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and
-sets its filters, and `CanSocket` reads it, so that frames lost in the kernel's queue are seen.
+python-can's own configuration (files, environment, `config_context`) opens the bus; [can.NAME] overrides it. Where the
+interface can filter, only error frames and frames with the ids of wheels come in. The kernel's stamp of a frame is mapped
+to the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and sets its filters,
+and `CanSocket` reads it, so that frames lost in the kernel's queue are counted.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from typing import Any
 import can
 
 from fusiond.config.schema import Can
+from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputLost
+from fusiond.units import nanoseconds
 from fusiond_adapters.can.decoder import EXTENDED, PDU2, CanDecoder
 from fusiond_adapters.can.kernel_socket import CanFrame, CanSocket
-from fusiond_adapters.host.clock import HostClock
 
 ID_BITS = 0x1FFFFFFF
 STANDARD_BITS = 0x7FF
-GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # what of a J1939 id tells its PGN, without and with a destination
+GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # bits of a J1939 id that hold its PGN, without and with a destination
 BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
 
 
 class CanDriver:
-    """Opens and reads the bus of whose frames `decoder` finds the wheels."""
+    """Opens and reads a bus; `decoder` knows which frames are wanted."""
 
-    def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: HostClock) -> None:
+    def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: Clock) -> None:
         self._decoder, self._inbox, self._clock = decoder, inbox, clock
 
     @contextmanager
@@ -49,14 +50,14 @@ class CanDriver:
             bus.shutdown()
 
     def read(self, bus: can.BusABC, stop: Event) -> None:
-        """Leave frames in the inbox until told to stop."""
+        """Put frames into the inbox until `stop` is set."""
         opened = getattr(bus, "socket", None)
         if isinstance(opened, socket.socket) and opened.family == socket.AF_CAN:
             self._read_socket(CanSocket(opened), stop)
         while not stop.is_set():
             message = bus.recv(POLL_S)
             if message is not None:
-                self._inbox.put(self._clock.from_wall_ns(round(message.timestamp * 1e9)), _frame(message))
+                self._inbox.put(self._clock.from_wall_ns(nanoseconds(message.timestamp)), _frame(message))
 
     def _read_socket(self, reader: CanSocket, stop: Event) -> None:
         before = self._inbox.missed

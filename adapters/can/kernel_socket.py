@@ -1,7 +1,7 @@
-"""Frames off a Linux CAN socket, with what the kernel tells beside them: when each came, and how many it had to drop.
+"""Frames from a Linux CAN socket, with the kernel's receive stamps and its count of dropped frames.
 
-python-can opens the socket, by its own configuration, and sets its filters; but its `recv` takes one frame a call and
-cannot bear SO_RXQ_OVFL, the only word there is of frames lost because nobody read them in time. So the socket is read here.
+python-can opens the socket and sets its filters. Its `recv` takes one frame per call and fails with SO_RXQ_OVFL, the only
+report of frames that were not read in time. So the socket is read here.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import struct
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from fusiond.units import SECOND
+
 SO_TIMESTAMPNS, SO_RXQ_OVFL = 35, 40  # asm-generic/socket.h; also the types of their control messages
 HEADER = struct.Struct("=IBB2x")  # of struct can_frame and canfd_frame: id and flags, length, FD flags
 CLASSIC_SIZE, FD_SIZE = 16, 72  # bytes of the structs
@@ -19,8 +21,8 @@ TIMESPEC, COUNTER = struct.Struct("@ll"), struct.Struct("=I")
 CONTROL_SIZE = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(COUNTER.size)
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000  # flags in the id, linux/can.h
 EXTENDED_BITS, STANDARD_BITS = 0x1FFFFFFF, 0x7FF
-MOST_AT_ONCE = 256
-QUEUE_BYTES = 1 << 20  # asked of the kernel, which gives up to net.core.rmem_max
+MAX_AT_ONCE = 256
+QUEUE_BYTES = 1 << 20  # requested receive buffer; the kernel gives up to net.core.rmem_max
 
 Control = Iterable[tuple[int, int, bytes]]  # level, type, data
 
@@ -49,12 +51,12 @@ def frame_of(content: bytes) -> CanFrame | None:
 
 
 def told_by(control: Control) -> tuple[int | None, int | None]:
-    """Wall clock's stamp [ns] and count of dropped frames in control messages; None for what is not there."""
+    """Wall clock's stamp [ns] and count of dropped frames in control messages; None where one is missing."""
     stamp = dropped = None
     for level, kind, data in control:
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= TIMESPEC.size:
             seconds, nanoseconds = TIMESPEC.unpack_from(data)
-            stamp = seconds * 10**9 + nanoseconds
+            stamp = seconds * SECOND + nanoseconds
         elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL and len(data) >= COUNTER.size:
             (dropped,) = COUNTER.unpack_from(data)
     return stamp, dropped
@@ -64,7 +66,7 @@ class CanSocket:
     """Reads a socket that something else opened and closes. Raises OSError where it is lost."""
 
     def __init__(self, opened: socket.socket) -> None:
-        self.dropped = 0  # frames that the kernel had no room for, so far
+        self.dropped = 0  # frames dropped by the kernel so far
         self._last_count = 0  # the kernel's count goes round at 2^32
         self._socket = opened
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -76,7 +78,7 @@ class CanSocket:
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return []
         found: list[tuple[int | None, CanFrame]] = []
-        while len(found) < MOST_AT_ONCE:
+        while len(found) < MAX_AT_ONCE:
             try:
                 content, control, _, _ = self._socket.recvmsg(FD_SIZE, CONTROL_SIZE, socket.MSG_DONTWAIT)
             except BlockingIOError:

@@ -1,7 +1,7 @@
-"""What Foxglove is shown, in a file or live: the published messages, and the same in Foxglove's own schemas, as JSON.
+"""Records for Foxglove, in a file or live: the published messages, and poses and fixes in Foxglove's own schemas, as JSON.
 
-Foxglove's 3-D panel wants a flat world with z up. `local_enu` is one: axes east, north, up at the origin, which is where
-the first state was; `base_link` is the body with axes forward, left, up. Both are right at any distance from the origin.
+Foxglove's 3-D panel needs a flat world with z up. `local_enu` has axes east, north, up at the origin, the position of the
+first state; `base_link` is the body with axes forward, left, up. Poses are exact at any distance from the origin.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from msgspec import Meta, Struct
 
 from fusiond.config.schema import Config
 from fusiond.config.sensor import INERTIAL
+from fusiond.messages.codec import encode
 from fusiond.messages.local_frame import ENU_FLU, LocalFrame
 from fusiond.messages.types import (
     MESSAGES,
@@ -28,10 +29,9 @@ from fusiond.messages.types import (
     State,
     StateAtInstant,
     StateMessage,
-    encode,
 )
+from fusiond.units import SECOND
 
-SECOND = 1_000_000_000  # ns
 ROOT, BODY = "local_enu", "base_link"  # frames
 KNOWN = 3  # position_covariance_type
 LEVELS: dict[Severity, int] = {"info": 2, "notice": 2, "warning": 3, "critical": 4}  # of foxglove.Log
@@ -40,7 +40,7 @@ Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
 
 class Channel(NamedTuple):
-    """A topic and what its messages look like: JSON by a JSON Schema that Foxglove can read."""
+    """A topic and the JSON Schema of its messages, as Foxglove can read it."""
 
     topic: str
     schema_name: str
@@ -51,8 +51,8 @@ class Record(NamedTuple):
     """A message on a topic."""
 
     topic: str
-    log_ns: int  # the instant it tells of
-    publish_ns: int  # when it was told
+    log_ns: int  # the instant it is valid for
+    publish_ns: int  # when it was published
     data: bytes
 
 
@@ -158,7 +158,7 @@ def judged(config: Config) -> list[str]:
 
 
 def channels(config: Config) -> list[Channel]:
-    """Every topic there is."""
+    """All topics."""
     found = [
         Channel(topic, name := f"foxglove.{kind.__name__}", readable_schema(kind, name)) for topic, kind in FOXGLOVE.items()
     ]
@@ -211,18 +211,18 @@ class _Origin(NamedTuple):
 
 
 class Converter:
-    """Published messages to what Foxglove is shown. Of states, at most `rate_hz` a second are, besides those that tell of
-    another mode or of a reset; None: all of them."""
+    """Published messages to records for Foxglove. States are thinned to `rate_hz`, but a change of mode or a reset is always
+    shown; None: all states."""
 
     def __init__(self, rate_hz: float | None = None) -> None:
         self._period_ns = SECOND / rate_hz if rate_hz else 1.0
-        self._turns: dict[type[Message], tuple[object, ...]] = {}  # by kind: what makes a state due when it changes
+        self._turns: dict[type[Message], tuple[object, ...]] = {}  # by kind: mode and resets, whose change makes a state due
         self._origin: _Origin | None = None
         self._origin_told: int | None = None  # second in which it was last
         self._tick_ns: int | None = None  # the latest
 
     def records(self, message: Message) -> Iterator[Record]:
-        """What is shown of a message; nothing if its turn has not come."""
+        """The records of a message; none if a state is not due."""
         if not isinstance(message, StateAtInstant | HealthMessage | InnovationMessage | EventMessage):
             return
         if isinstance(message, StateMessage):
@@ -249,7 +249,7 @@ class Converter:
         if self._origin is None:
             self._origin = _Origin(LocalFrame.at(state, ENU_FLU), state)
         frame, place = self._origin.frame, self._origin.state
-        if self._origin_told != time.sec:  # once a second, for whoever comes late
+        if self._origin_told != time.sec:  # once a second, for clients that connect later
             self._origin_told = time.sec
             fix = _fix(time, ROOT, place, frame)
             yield ORIGIN, msgspec.structs.replace(fix, heading=0.0, velocity=Vector3(0.0, 0.0, 0.0))

@@ -1,15 +1,16 @@
 """Foxglove live: a WebSocket server with the topics of the MCAP files. Needs the extra `foxglove`.
 
-The server is the SDK's own, in threads outside Python; to a client that is slow it drops the oldest messages.
+The SDK's own server runs in threads outside Python. For a slow client it drops the oldest messages.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from threading import Event
 
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
 from fusiond_adapters.foxglove.converter import SHOWN, Converter, channels
 
 try:
@@ -17,7 +18,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[foxglove] needs the extra foxglove: pip install 'fusiond[foxglove]'") from missing
 
-MOST_WAITING = 1024  # messages between the estimator and the server, and as many again to each client
+MAX_WAITING = 1024  # messages between the estimator and the server, and as many again to each client
 
 
 class FoxgloveServer:
@@ -27,14 +28,15 @@ class FoxgloveServer:
 
     def __init__(self, config: Config) -> None:
         self.about = f"Foxglove server on {config.foxglove.host}:{config.foxglove.port}"
-        self.outbox = Outbox(MOST_WAITING, SHOWN)
+        self.outbox = Outbox(MAX_WAITING, SHOWN)
         self.shown = 0  # records given to the server
+        self.unknown = 0  # records of topics that it does not have; they are left out
         self.url: str | None = None  # while it runs
         self._config = config
         self._converter = Converter(config.foxglove.rate_hz)
 
     def session(self, stop: Event) -> None:
-        """Serve until told to stop. Raises OutputLost."""
+        """Serve until `stop` is set. Raises OutputLost."""
         section, context = self._config.foxglove, Context()
         try:
             server = start_server(
@@ -42,7 +44,7 @@ class FoxgloveServer:
                 host=section.host,
                 port=section.port,
                 context=context,
-                message_backlog_size=MOST_WAITING,
+                message_backlog_size=MAX_WAITING,
             )
         except RuntimeError as error:  # all that the SDK raises
             raise OutputLost(f"{self.about}: {error}") from error
@@ -54,8 +56,8 @@ class FoxgloveServer:
             server.stop()
 
     def counts(self) -> dict[str, int]:
-        """Records."""
-        return {"records": self.shown}
+        """Records shown, and those of topics that it does not have."""
+        return {"records": self.shown, "unknown topics": self.unknown}
 
     def notes(self) -> dict[str, str]:
         """Where to connect to."""
@@ -76,7 +78,16 @@ class FoxgloveServer:
             stopping = stop.is_set()  # before the last look, so that it misses nothing
             for message in self.outbox.take(POLL_S):
                 for record in self._converter.records(message):
-                    topics[record.topic].log(record.data, log_time=record.log_ns)
+                    topic = topics.get(record.topic)
+                    if topic is None:
+                        self.unknown += 1
+                        continue
+                    topic.log(record.data, log_time=record.log_ns)
                     self.shown += 1
-        for topic in topics.values():
-            topic.close()
+        for one in topics.values():
+            one.close()
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [FoxgloveServer(config)]

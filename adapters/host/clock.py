@@ -1,20 +1,20 @@
 """The host's time line of a live run: Unix time at the start, carried on by the monotonic clock.
 
-So a step of the wall clock (NTP, a GNSS receiver that sets it) moves no stamp. The price is that the time line keeps
-the error which the wall clock had at the start; the clock alignment sees it as an offset of the Unix stamps.
+A step of the wall clock (NTP, a GNSS receiver that sets it) moves no stamp. In return the time line keeps the error that
+the wall clock had at the start; the clock alignment sees it as an offset of the Unix stamps.
 """
 
 from __future__ import annotations
 
 import time
 
-OLDEST_NS = 2_000_000_000  # a kernel stamp older than this at its reading is not believed
+OLDEST_NS = 2_000_000_000  # a kernel stamp older than this when it is read is rejected
 
 
 class HostClock:
     """Stamps of receipt. One for all the inputs of a run; `start_ns` lets a played drive have its own time."""
 
-    speed = 1.0  # how many times as fast as time it runs
+    speed = 1.0  # relative to real time
 
     def __init__(self, start_ns: int | None = None) -> None:
         self._offset_ns = (time.time_ns() if start_ns is None else start_ns) - time.monotonic_ns()
@@ -24,7 +24,7 @@ class HostClock:
         return time.monotonic_ns() + self._offset_ns
 
     def from_wall_ns(self, wall_ns: int) -> int:
-        """The instant that the wall clock called `wall_ns` a moment ago: so much before now as the wall clock says. Now
-        itself where that is not plausible: the wall clock was set meanwhile, or the stamp is of another clock."""
+        """The instant of a recent wall clock stamp: as long before now as the wall clock says. Now itself where that is
+        implausible: the wall clock was set in between, or the stamp is of another clock."""
         age_ns = time.time_ns() - wall_ns
         return self.now_ns() - (age_ns if 0 <= age_ns <= OLDEST_NS else 0)

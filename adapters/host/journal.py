@@ -1,8 +1,8 @@
-"""What is logged: under systemd in the journal's own protocol, with fields; else as lines on stderr.
+"""Logging: under systemd in the journal's own protocol, with fields; otherwise as lines on stderr.
 
 A record's `extra` gives fields: FUSIOND_SOURCE (the input or output that it is about), FUSIOND_MODE, MESSAGE_ID (the
-kind of event, for `journalctl MESSAGE_ID=...`). What is said again and again is counted instead, and the count told
-with the next one that is said after REPEAT_S.
+kind of event, for `journalctl MESSAGE_ID=...`). Repeats are counted instead of logged; the next record after REPEAT_S gives
+their number.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import TextIO
 
 ADDRESS = "/run/systemd/journal/socket"
 PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))  # syslog's
-REPEAT_S = 30.0  # within this the same is not said twice
-MOST_KEPT = 256  # different messages that are remembered
+REPEAT_S = 30.0  # a record is not repeated within this time
+MAX_KEPT = 256  # different messages that are remembered
 
 # MESSAGE_ID by kind of event
 EVENTS = {
@@ -43,15 +43,15 @@ def about(kind: str, subject: str) -> dict[str, str]:
 
 
 class Repeats(logging.Filter):
-    """Lets the first of equal records pass, counts those within REPEAT_S after it, tells their number with the next."""
+    """Lets the first of equal records pass and counts those within REPEAT_S after it; the next one gives their number."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._now = now
-        self._said: dict[tuple[int, str], tuple[float, int]] = {}  # level and text: when it was said, repeats since
+        self._said: dict[tuple[int, str], tuple[float, int]] = {}  # by level and text: when it was logged, repeats since
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether to say it. An event that is no warning always is: it tells how things stand."""
+        """Whether to log it. An event below warning always is: it reports a change."""
         if record.levelno < logging.WARNING and hasattr(record, "MESSAGE_ID"):
             return True
         key = record.levelno, record.getMessage()
@@ -62,7 +62,7 @@ class Repeats(logging.Filter):
             return False
         self._said.pop(key, None)
         self._said[key] = now, 0
-        if len(self._said) > MOST_KEPT:
+        if len(self._said) > MAX_KEPT:
             del self._said[next(iter(self._said))]
         if said is not None and count:
             record.msg, record.args = f"{key[1]} ({count} times more in the {now - said:.0f} s before)", ()
@@ -70,7 +70,7 @@ class Repeats(logging.Filter):
 
 
 class JournalHandler(logging.Handler):
-    """Sends records to the journal, a datagram each. What the journal does not take is counted in `lost`."""
+    """Sends each record to the journal as a datagram. Records that the journal does not take are counted in `lost`."""
 
     def __init__(self, address: str = ADDRESS) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ class JournalHandler(logging.Handler):
             self.lost += 1
 
     def close(self) -> None:
-        """Send no more."""
+        """Close the socket."""
         self._socket.close()
         super().close()
 
@@ -111,7 +111,7 @@ def fields(record: logging.LogRecord) -> Iterator[tuple[str, str]]:
 
 
 def _field(name: str, value: str) -> bytes:
-    """As the native protocol has it: a line, or, where the value has several, its length and then itself."""
+    """A field in the native protocol: one line, or for a value of several lines its length and then the value."""
     data = value.encode("utf-8", "backslashreplace")
     if b"\n" not in data:
         return name.encode() + b"=" + data + b"\n"
@@ -133,4 +133,4 @@ def set_up(level: int = logging.INFO) -> None:
     handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
     handler.addFilter(Repeats())
     logging.basicConfig(level=level, handlers=[handler], force=True)
-    logging.getLogger("can").setLevel(logging.CRITICAL)  # what python-can has to say of a bus that is away is raised as well
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # python-can logs a missing bus and raises it too

@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, reloading, stopping. One datagram each; nothing where nobody asked."""
+"""Notifications to systemd: ready, alive, reloading, stopping. One datagram each; none without $NOTIFY_SOCKET."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import os
 import socket
 import time
 
+from fusiond.units import MICROSECOND
+
 
 class Notifier:
-    """The service manager's ear: $NOTIFY_SOCKET, by default that of the environment."""
+    """Sends to the service manager at $NOTIFY_SOCKET, by default that of the environment."""
 
     def __init__(self, address: str | None = None) -> None:
         address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
@@ -17,7 +19,7 @@ class Notifier:
         self.lost = 0  # notifications that could not be delivered
         if address:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-            self._socket.setblocking(False)  # a deaf service manager must not hang us
+            self._socket.setblocking(False)  # a stuck service manager must not block the daemon
 
     def ready(self, status: str) -> None:
         """Start, or reload, is complete."""
@@ -29,7 +31,7 @@ class Notifier:
 
     def reloading(self) -> None:
         """A reload has begun; `ready` ends it."""
-        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // MICROSECOND}")
 
     def stopping(self) -> None:
         """A clean end has begun."""
@@ -44,14 +46,14 @@ class Notifier:
             self.lost += 1
 
     def close(self) -> None:
-        """Say no more."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
 
 def watchdog_s() -> float | None:
-    """How often the watchdog wants to be fed at the least [s]: half of what it allows; None where there is none."""
+    """Longest time between two feeds of the watchdog [s]: half of its timeout; None where there is none."""
     allowed = os.environ.get("WATCHDOG_USEC", "")
     meant = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
     return int(allowed) / 2e6 if allowed.isdecimal() and meant else None

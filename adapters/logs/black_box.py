@@ -1,48 +1,24 @@
-"""The black box: what was received, in native formats, in files of bounded size, the oldest of which go in time.
+"""The black box: records everything received, in native formats, in a folder of bounded size.
 
 A file is named by the instant of its first frame, then `LINK.tlog`, `can.log`, or `state.json` for the stored state that
-the run began with, so that names sort by time. Frames are
-handed over without waiting; a thread writes them. When the disk is full or slow, frames are lost to the box alone: they
-are counted, and the box goes on with a new file as soon as it can.
+the run began with. The caller never waits: a thread writes the frames. When the disk is full or slow, only the black box
+loses frames: it counts them, and starts a new file as soon as it can.
 """
 
 from __future__ import annotations
 
-import re
 from collections import deque
-from collections.abc import Set
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import Condition, Thread
 from types import TracebackType
 from typing import BinaryIO
 
-MEGABYTE = 1_000_000
-MOST_WAITING = 100_000  # records between the engine and the disk
-FLUSH_S = 1.0  # what is lost at a crash, at the most
-RETRY_NS = 5_000_000_000  # after an error records are passed over for so long before the disk is tried again
-NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-\w+\.(tlog|log|json)")  # nothing else in the folder is ever removed
+from fusiond.units import SECOND
+from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, file_name, make_room, name_pattern
 
-
-def file_name(t_ns: int, kind: str) -> str:
-    """The name of a file whose first record is of that instant."""
-    instant = datetime.fromtimestamp(t_ns // 10**9, UTC)
-    return f"{instant:%Y%m%dT%H%M%S}.{t_ns % 10**9 // 1000:06d}Z-{kind}"
-
-
-def make_room(
-    folder: Path, name: re.Pattern[str], file_bytes: int, total_bytes: int, open_files: Set[Path] = frozenset()
-) -> None:
-    """Remove the oldest of the files so named, as long as one more full one could exceed the limit. Raises OSError."""
-    files = sorted(path for path in folder.iterdir() if name.fullmatch(path.name))
-    sizes = {path: file_bytes if path in open_files else path.stat().st_size for path in files}
-    total = sum(sizes.values()) + file_bytes
-    for path in files:
-        if total <= total_bytes:
-            return
-        if path not in open_files:
-            path.unlink()
-            total -= sizes[path]
+MAX_WAITING = 100_000  # records between the engine and the disk
+RETRY_NS = 5 * SECOND  # pause after an error; records of that time are lost
+NAME = name_pattern(r"\w+\.(tlog|log|json)")  # nothing else in the folder is ever removed
 
 
 class Recorder:
@@ -68,7 +44,7 @@ class Recorder:
 
     def add(self, kind: str, t_ns: int, record: bytes) -> None:
         """Hand over a record of a kind of file (`LINK.tlog`, `can.log`). Never waits."""
-        if len(self._waiting) >= MOST_WAITING:
+        if len(self._waiting) >= MAX_WAITING:
             self.lost += 1
         else:
             self._waiting.append((kind, t_ns, record))

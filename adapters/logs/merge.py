@@ -12,23 +12,21 @@ from typing import TypeVar
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
-from fusiond_adapters.can.decoder import CanDecoder
-from fusiond_adapters.logs import LogError, LogInput, canlog
-from fusiond_adapters.logs.canlog import read_can_log
-from fusiond_adapters.logs.tlog import read_tlog
-from fusiond_adapters.mavlink.decoder import MavlinkDecoder
+from fusiond.units import SECOND
+from fusiond_adapters.logs.file import LogError, LogFile
+from fusiond_adapters.logs.format import Opening, Reading
+from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
-KNOWN = ".tlog, .log (candump -L), .asc, .blf, .trc, .csv, .db, .mf4; all but .db and .mf4 also with .gz"
 
 Item = TypeVar("Item")
 
 
 def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
-    """Make ready to read the logs of one drive. Nothing but their size is looked at yet.
+    """Prepare the logs of one drive for reading. Only their sizes are read yet.
 
-    A path is that of a .tlog or a CAN log, by its suffix. A .tlog belongs to the first [mavlink.NAME]; a CAN log may
-    hold any [can.NAME], told apart by channel (see `canlog`). `LINK=path` or `BUS=path` says whose it is.
+    The suffix of a path gives the format. A .tlog belongs to the first [mavlink.NAME]; a CAN log may hold any [can.NAME],
+    told apart by channel (see `can_channels`). `LINK=path` or `BUS=path` says which it is.
     Raises LogError for a path that cannot be a log, ConfigError for a configuration that does not fit its DBC files.
     """
     if not paths:
@@ -40,8 +38,8 @@ def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
 class LogSet:
     """The logs of one drive; iterating, once, yields their events merged by `t_receive_ns`.
 
-    Each log keeps its own order. Where its stamps run back, an event is placed as if received with the latest one
-    before it, so that nothing is lost and no other log is held up. Ties go by the order in which the logs were given.
+    Each log keeps its own order. Where its stamps run back, an event counts as received with the latest one
+    before it: nothing is lost, and no other log is delayed. Ties go by the order in which the logs were given.
     Iterating raises LogError where a file turns out to be no log.
     """
 
@@ -69,7 +67,7 @@ class LogSet:
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """What became of the content, by log; counts that are 0 are left out."""
+        """Counts of the content by log, without those that are 0."""
         return {str(log.file.path): log.counts() for log in self._logs}
 
     @property
@@ -77,8 +75,8 @@ class LogSet:
         """What the user should know about the logs, complete once they are read."""
         found = [warning for log in self._logs for warning in log.file.warnings]
         found += [f"{log.file.path}: nothing in it that the configuration asks for" for log in self._logs if log.barren]
-        links = [log for log in self._logs if log.first_ns is not None and log.is_mavlink]
-        buses = [log for log in self._logs if log.first_ns is not None and not log.is_mavlink]
+        links = [log for log in self._logs if log.first_ns is not None and log.protocol == "mavlink"]
+        buses = [log for log in self._logs if log.first_ns is not None and log.protocol == "can"]
         if links and buses and not any(link.overlaps(bus) for link in links for bus in buses):
             spans = "; ".join(log.span() for log in (*links, *buses))
             found.append(f"the MAVLink and the CAN logs do not overlap in time: {spans}")
@@ -86,8 +84,8 @@ class LogSet:
 
 
 def _ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same, read so many at a time: to read for a while and then to fuse for a while is faster by a sixth, as the
-    processor then finds code and data of each in its caches."""
+    """The same items, read READ_AHEAD at a time. Alternating long stretches of reading and fusing is faster by a sixth: code
+    and data stay in the processor's caches."""
     while some := list(islice(items, READ_AHEAD)):
         yield from some
 
@@ -95,21 +93,18 @@ def _ahead(items: Iterator[Item]) -> Iterator[Item]:
 class _Log:
     """One log, its decoders, and the stamps seen in it."""
 
-    def __init__(
-        self, file: LogInput, decoders: Sequence[MavlinkDecoder | CanDecoder], frames: Iterator[list[Received]]
-    ) -> None:
+    def __init__(self, file: LogFile, reading: Reading) -> None:
         self.file = file
-        self.is_mavlink = isinstance(decoders[0], MavlinkDecoder)
+        self.protocol = reading.protocol
         self.first_ns: int | None = None
         self.last_ns = 0
         self.barren = False  # read to its end without an event
-        self._decoders = decoders
-        self._frames = frames  # the events of each
+        self._reading = reading
 
     def placed(self) -> Iterator[tuple[int, list[Received]]]:
         """The events of each frame, with the greatest receive stamp so far."""
         latest_ns: int | None = None
-        for events in self._frames:
+        for events in self._reading.frames:
             if not events:
                 continue
             t_ns = events[0].t_receive_ns
@@ -126,7 +121,7 @@ class _Log:
 
     def counts(self) -> dict[str, int]:
         total = self.file.counts.copy()
-        for decoder in self._decoders:
+        for decoder in self._reading.decoders:
             total.update(decoder.counts)
         return {name: count for name, count in total.items() if count}
 
@@ -141,38 +136,31 @@ class _Log:
 
 
 def _readable(t_ns: int) -> str:
-    seconds = t_ns // 10**9
+    seconds = t_ns // SECOND
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _open(argument: str, config: Config, sequences: dict[str, int]) -> _Log:
     name, path = _split(argument, config)
-    file = LogInput(path)
-    if file.suffix == ".tlog":
-        if not config.mavlink:
-            raise LogError(f"{path}: the configuration has no [mavlink.NAME] to take it for")
-        link = name if name is not None else next(iter(config.mavlink))
-        if link not in config.mavlink:
-            raise LogError(f"{argument}: a .tlog is a MAVLink log; configured links: {', '.join(config.mavlink)}")
-        decoder = MavlinkDecoder(config, link, sequences)
-        return _Log(file, [decoder], read_tlog(file, decoder))
-    if file.suffix not in canlog.SUFFIXES or (file.zipped and file.suffix in canlog.UNZIPPED_ONLY):
-        raise LogError(f"{path}: unknown kind of log; known: {KNOWN}")
-    if not config.can:
-        raise LogError(f"{path}: the configuration has no [can.NAME] to take it for")
-    if name is not None and name not in config.can:
-        raise LogError(f"{argument}: a {file.suffix} is a CAN log; configured buses: {', '.join(config.can)}")
-    buses = config.can if name is None else (name,)
-    decoders = {bus: CanDecoder(config, bus, sequences) for bus in buses}
-    return _Log(file, list(decoders.values()), read_can_log(file, decoders, config, named=name is not None))
+    file = LogFile(path)
+    for kind in LOG_FORMATS:
+        if kind.suffix == file.suffix and (kind.zipped or not file.zipped):
+            return _Log(file, kind.open(Opening(file, kind.about, name, config, sequences)))
+    raise LogError(f"{path}: unknown kind of log; known: {_known()}")
+
+
+def _known() -> str:
+    known = ", ".join(f"{kind.suffix} ({kind.about})" for kind in LOG_FORMATS)
+    unzipped = " and ".join(kind.suffix for kind in LOG_FORMATS if not kind.zipped)
+    return f"{known}; all but {unzipped} also with .gz"
 
 
 def _split(argument: str, config: Config) -> tuple[str | None, str]:
     """`NAME=path` into its parts; a `=` that does not follow a link's or bus's name belongs to the path."""
     name, equals, path = argument.partition("=")
-    if equals and (name in config.mavlink or name in config.can):
+    known = [configured for section in INPUTS for configured in getattr(config, section)]
+    if equals and name in known:
         return name, path
     if equals and name.isidentifier() and not Path(argument).exists():
-        known = ", ".join((*config.mavlink, *config.can)) or "none"
-        raise LogError(f"{argument}: there is no link or bus '{name}'; configured: {known}")
+        raise LogError(f"{argument}: there is no link or bus '{name}'; configured: {', '.join(known) or 'none'}")
     return None, argument

@@ -1,7 +1,7 @@
-"""Plays a recorded drive onto live inputs as the vehicle would: MAVLink frames over UDP, CAN frames by python-can.
+"""Plays a recorded drive into live inputs as the vehicle would: MAVLink frames over UDP, CAN frames by python-can.
 
-At true speed the clock is the host's, and a daemon that is too slow loses frames as on a vehicle. Faster than that, the
-clock is the player's own: it waits whenever the daemon has fallen behind, so that it runs as fast as the machine allows.
+In real time the clock is the host's, and a daemon that is too slow loses frames as on a vehicle. Faster than real time,
+the player has a clock of its own, which waits whenever the daemon falls behind.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from typing import Any
 
 import can
 
+from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.host.clock import HostClock
-from fusiond_adapters.logs import LogInput
-from fusiond_adapters.logs.tlog import STAMP, STAMP_SIZE
+from fusiond_adapters.logs.file import LogFile
 from fusiond_adapters.mavlink.decoder import frame_length
+from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
 SHORTEST_S = 0.0005  # no sleep is shorter: records that are due within this are sent together
-BEHIND_NS = 20_000_000  # a daemon that has fallen behind by more is waited for
+BEHIND_NS = 20_000_000  # the clock waits for a daemon that is further behind
 LOOK_S = 0.0002  # between two looks at it
-PATIENCE_S = 1.0  # no longer: the drive may have a hole
+PATIENCE_S = 1.0  # longest wait: the drive may have a gap
 
 
 class PlayedClock(HostClock):
-    """A clock that the player sets, up to `speed` times as fast as time."""
+    """A clock that the player sets, up to `speed` times as fast as real time."""
 
     def __init__(self, start_ns: int, speed: float) -> None:
         super().__init__(start_ns)
@@ -50,20 +51,20 @@ class PlayedClock(HostClock):
 
 def mavlink_records(path: Path) -> Iterator[tuple[int, bytes]]:
     """Stamp [ns] and frame of each record of an undamaged .tlog (or .tlog.gz). Raises LogError."""
-    data = b"".join(LogInput(path).blocks())
+    data = b"".join(LogFile(path).blocks())
     at = 0
     while at + STAMP_SIZE < len(data):
         (stamp_us,) = STAMP.unpack_from(data, at)
         begin = at + STAMP_SIZE
         at = begin + (frame_length(data, begin) or len(data))
-        yield 1000 * stamp_us, data[begin:at]
+        yield stamp_us * MICROSECOND, data[begin:at]
 
 
 def can_records(path: Path) -> Iterator[tuple[int, can.Message]]:
     """Stamp [ns] and frame of each record of a CAN log that python-can reads."""
     with can.LogReader(path) as reader:
         for message in reader:
-            yield round(message.timestamp * 1e6) * 1000, message
+            yield round(message.timestamp * 1e6) * MICROSECOND, message
 
 
 class Player:
@@ -72,7 +73,7 @@ class Player:
     def __init__(self, mavlink: Path, canlog: Path, port: int, bus: can.BusABC) -> None:
         self.sent_mavlink = 0  # frames
         self.sent_can: dict[int, int] = {}  # frames by id
-        self.since_ns = self.late_ns = 0  # how much of the drive has been played; how far behind that was at the most
+        self.since_ns = self.late_ns = 0  # how much of the drive has been played; largest delay of a record
         self.seconds = 0.0  # it took
         self._bus, self._port = bus, port
         records: list[tuple[int, Callable[[Any], object], Any]] = []
@@ -83,16 +84,16 @@ class Player:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def play(self, clock: HostClock, heard_ns: Callable[[], int], halt: Event) -> Iterator[int]:
-        """Send every record when it is due, until told to halt; gives each stamp. `heard_ns` is the stamp up to which
-        the daemon has taken what was sent; 0 before the first."""
+        """Send every record when it is due, until `halt` is set; yields each stamp. `heard_ns` gives the stamp up to which
+        the daemon has taken records; 0 before the first."""
         began = time.monotonic()
         for t_ns, send, item in self._records:
             if isinstance(clock, PlayedClock):
-                _sleep(began + (t_ns - self.begin_ns) / clock.speed / 1e9 - time.monotonic())
+                _sleep(began + (t_ns - self.begin_ns) / clock.speed / SECOND - time.monotonic())
                 _await(lambda t_ns=t_ns: not 0 < heard_ns() < t_ns - BEHIND_NS)  # type: ignore[misc]
                 clock.set(t_ns)
             else:
-                _sleep((t_ns - clock.now_ns()) / 1e9)
+                _sleep((t_ns - clock.now_ns()) / SECOND)
             if halt.is_set():
                 return
             self.late_ns = max(self.late_ns, clock.now_ns() - t_ns)
@@ -122,7 +123,7 @@ def _sleep(seconds: float) -> None:
 
 
 def _await(condition: Callable[[], bool]) -> None:
-    """Wait until something holds, but not for long."""
+    """Wait until a condition holds, at most PATIENCE_S."""
     ends = time.monotonic() + PATIENCE_S
     while not condition() and time.monotonic() < ends:
         time.sleep(LOOK_S)

@@ -1,9 +1,9 @@
 """Reader of .tlog: MAVLink frames, each after the microseconds of Unix time of its receipt (8 bytes, big endian).
 
-The file may be damaged anywhere. While the records follow one another the magic bytes alone are looked at, and what the
-decoder does not want is passed over by its header; where the next record is missing, checksums decide, and the search for
-it goes on byte by byte. Stamps that jump are compared with their neighbours: a lone outlier is dropped with its record, a
-clock that was set is followed.
+The file may be damaged anywhere. While one record follows another, only the magic bytes are checked, and unwanted frames
+are skipped by their headers. Where the next record is missing, the search goes on byte by byte and checksums decide. A
+stamp that jumps is compared with its neighbours: a single outlier is dropped with its record, a clock that was set is
+followed.
 
 Counts: `records`, `bad bytes` (skipped between records), `truncated tail` (the last record is cut off), `bad stamps`
 (records dropped for their stamp), `clock set back`.
@@ -15,7 +15,9 @@ from collections.abc import Generator, Iterator
 from struct import Struct
 
 from fusiond.events import Received
-from fusiond_adapters.logs import LogError, LogInput
+from fusiond.units import MICROSECOND
+from fusiond_adapters.logs.file import LogError, LogFile
+from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.decoder import (
     CHECKSUM,
     HEADER_2,
@@ -29,9 +31,8 @@ from fusiond_adapters.mavlink.decoder import (
     MavlinkDecoder,
     frame_length,
 )
+from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
-STAMP = Struct(">Q")  # microseconds of Unix time
-STAMP_SIZE = STAMP.size
 RECORD_2 = Struct(">Q10B")  # stamp, and the header of a MAVLink 2 frame
 OVERHEAD = STAMP_SIZE + HEADER_2 + CHECKSUM  # bytes of a MAVLink 2 record without its payload
 OVERHEAD_SIGNED = OVERHEAD + SIGNATURE
@@ -42,7 +43,20 @@ STEP_US = 10**6  # a stamp that jumps by more is compared with the next one
 REACH = 2 * (STAMP_SIZE + LONGEST_FRAME)  # bytes in which a whole record and the next one's beginning lie
 
 
-def read_tlog(log: LogInput, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
+def open_log(opening: Opening) -> Reading:
+    """The reading of a .tlog, by default of the first link. Raises LogError where no link is configured, or not that one;
+    ConfigError where the dialect lacks a wanted message."""
+    path, links = opening.file.path, opening.config.mavlink
+    if not links:
+        raise LogError(f"{path}: the configuration has no [mavlink.NAME] for it")
+    link = next(iter(links)) if opening.name is None else opening.name
+    if link not in links:
+        raise LogError(f"{link}={path}: a .tlog is a MAVLink log; configured links: {', '.join(links)}")
+    decoder = MavlinkDecoder(opening.config, link, opening.sequences)
+    return Reading("mavlink", [decoder], read_tlog(opening.file, decoder))
+
+
+def read_tlog(log: LogFile, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
     """The events of a .tlog, frame by frame in the order of the file. Raises LogError where there is no MAVLink in it."""
     yield from _Records(log, decoder)
     if not log.counts["records"]:
@@ -52,7 +66,7 @@ def read_tlog(log: LogInput, decoder: MavlinkDecoder) -> Iterator[list[Received]
 class _Records:
     """Cuts a .tlog into records and has them decoded."""
 
-    def __init__(self, log: LogInput, decoder: MavlinkDecoder) -> None:
+    def __init__(self, log: LogFile, decoder: MavlinkDecoder) -> None:
         self._blocks = log.blocks()
         self._counts = log.counts
         self._decoder, self._dialect = decoder, decoder.dialect
@@ -90,7 +104,7 @@ class _Records:
             counts["records"] += 1
             stamp_us: int = STAMP.unpack_from(self._buffer, at)[0]
             if self._stamp_is_good(stamp_us, at + size):
-                yield self._decoder.decode(self._buffer[at + STAMP_SIZE : at + size], stamp_us * 1000)
+                yield self._decoder.decode(self._buffer[at + STAMP_SIZE : at + size], stamp_us * MICROSECOND)
             at += size
         if cut:
             counts["truncated tail"] += 1
@@ -98,8 +112,8 @@ class _Records:
             counts["bad bytes"] += skipped
 
     def _plain(self, at: int) -> Generator[list[Received], None, int]:
-        """Cut the ordinary MAVLink 2 records from `at` on. Returns where the buffer runs short, or a record stands that is
-        to be looked at closely."""
+        """Cut the ordinary MAVLink 2 records from `at` on. Returns where the buffer ends, or where a record needs a closer
+        look."""
         buffer, unpack, take = self._buffer, RECORD_2.unpack_from, self._decoder.take
         until, records, last_us = len(buffer) - REACH, 0, self._last_us
         while at <= until and last_us is not None:
@@ -112,7 +126,7 @@ class _Records:
             last_us = stamp_us
             records += 1
             number, frame = low | middle << 8 | high << 16, buffer[at + STAMP_SIZE : end]
-            events = take(number, counter, system, component, frame, stamp_us * 1000)
+            events = take(number, counter, system, component, frame, stamp_us * MICROSECOND)
             at = end
             if events:
                 yield events

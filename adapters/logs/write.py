@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterator
 from operator import itemgetter
 from pathlib import Path
-from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,9 @@ from fusiond.simulation.scenario import Scenario
 from fusiond.simulation.transport import Stamps
 from fusiond.simulation.truth import Truth
 from fusiond.simulation.wire import SYSTEM, Telemetry
+from fusiond.units import MICROSECOND
+from fusiond_adapters.mavlink.tlog_record import tlog_record
 
-STAMP = Struct(">Q")  # microseconds of Unix time
 COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 HDOP, VDOP, SATELLITES = 80, 120, 14  # of a fix; the first two in hundredths
@@ -61,7 +61,7 @@ def write_tlog(drive: Drive, path: Path) -> None:
     with path.open("wb") as file:
         for t_us, counter, message in heapq.merge(*streams, key=itemgetter(0)):
             link.seq = counter
-            file.write(STAMP.pack(t_us) + message.pack(link))
+            file.write(tlog_record(message.pack(link), t_us * MICROSECOND))
 
 
 def _imu(drive: Drive) -> Stamped:
@@ -199,7 +199,7 @@ def write_truth(truth: Truth, rate_hz: float, path: Path) -> None:
     interval_ns = int(np.diff(truth.t_ns[:2]).sum()) or 1
     every = max(1, round(1e9 / rate_hz / interval_ns))
     angles = np.degrees(np.column_stack([truth.latitude, truth.longitude, truth.euler]))[::every]
-    columns = (truth.t_ns // 1000, truth.height, truth.velocity_n)
+    columns = (truth.t_ns // MICROSECOND, truth.height, truth.velocity_n)
     stamps, heights, velocities = (column[::every].tolist() for column in columns)
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(TRUTH_COLUMNS + "\n")

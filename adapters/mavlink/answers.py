@@ -1,9 +1,8 @@
 """Answers to the MAVLink command and parameter protocols. No I/O.
 
 Commands: MAV_CMD_REQUEST_MESSAGE, MAV_CMD_SET_MESSAGE_INTERVAL and MAV_CMD_GET_MESSAGE_INTERVAL, for the messages that are
-sent here; every other command addressed to our component is answered with "unsupported". One that is addressed to all
-components is answered only where it is ours to obey. Parameters are single floats; what cannot be set is answered with
-its present value, as the protocol has it.
+sent here. Other commands to our component are answered with "unsupported"; a command to all components is answered only if
+we can obey it. Parameters are single floats; a rejected value is answered with the present one, as the protocol demands.
 """
 
 from __future__ import annotations
@@ -53,8 +52,8 @@ class Parameter:
 
 
 class Responder:
-    """What is answered. `paces` are those of the messages sent here, by message id; commands change them. Messages that
-    are wanted once are in `requested` until whoever sends them takes them out."""
+    """Answers commands and parameter requests. `paces` are those of the messages sent here, by message id; commands change
+    them. Messages requested once stay in `requested` until their sender removes them."""
 
     def __init__(self, parameters: Sequence[Parameter], paces: Mapping[int, Pace]) -> None:
         self.requested: set[int] = set()
@@ -63,7 +62,7 @@ class Responder:
         self._usual_hz = {number: pace.rate_hz for number, pace in paces.items()}
 
     def answers(self, message: Any, us: tuple[int, int]) -> Iterator[Any]:
-        """The answers to a message (one of HANDLED), as `us`: system, component; none where we are not addressed."""
+        """The answers to a message (one of HANDLED), as `us`: system, component; empty where we are not addressed."""
         if message.target_system not in (0, us[0]) or message.target_component not in (0, us[1]):
             return
         kind = message.get_msgId()

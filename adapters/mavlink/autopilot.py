@@ -1,9 +1,9 @@
-"""The state back to the autopilot, as a source of its own estimator; and what that estimator makes of it.
+"""The state sent to the autopilot as a source of its own estimator, and whether that estimator uses it.
 
-Messages go out on the open link of a MAVLink input, from this output's own thread. Only a state that is fit is sent;
-why it is not is told in the health, and once in a STATUSTEXT. Whether the autopilot uses what it gets is read from its
-EKF_STATUS_REPORT or ESTIMATOR_STATUS, which the link asks for (`mavlink_talk`), and from what ArduPilot's EKF3 says in
-STATUSTEXTs: "is using external nav data", "stopped aiding".
+Messages go out on the open link of a MAVLink input, from this output's own thread. Only a state within the configured
+limits is sent; the health says why one is not, and so does one STATUSTEXT. Whether the autopilot uses the state is read
+from its EKF_STATUS_REPORT or ESTIMATOR_STATUS, which the link requests (`talk`), and from the STATUSTEXTs of ArduPilot's
+EKF3: "is using external nav data", "stopped aiding".
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from fusiond.config.schema import Autopilot, Config
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import State, StateMessage
 from fusiond.ports.outputs import POLL_S, Outbox
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.answers import Parameter
 from fusiond_adapters.mavlink.decoder import message_id
 from fusiond_adapters.mavlink.link import MavlinkLink
@@ -34,16 +35,15 @@ from fusiond_adapters.mavlink.outgoing import (
     vision_position,
 )
 
-SECOND = 1_000_000_000  # ns
 OUTBOX = 64  # messages
-LEAST_HZ = 4.0  # ArduPilot takes a source for dead below that
+MIN_HZ = 4.0  # ArduPilot gives up a source below this rate
 STALE_NS = SECOND  # a state that waited for longer is not sent
-SILENT_NS = 5 * SECOND  # an estimator's status older than this counts no more
+SILENT_NS = 5 * SECOND  # an older estimator status is ignored
 TEXT_NS = 5 * SECOND  # between two STATUSTEXTs
 ORIGIN_NS = 2 * SECOND  # between two SET_GPS_GLOBAL_ORIGINs, until the autopilot names its origin
-ORIGIN_APART_M = 1.0  # more than this between the autopilot's origin and ours is told
+ORIGIN_APART_M = 1.0  # a larger distance between the autopilot's origin and ours is reported
 GATE = 1.0  # of a test ratio
-ARDUPILOT_UNINITIALISED = 1024  # EKF_STATUS_FLAGS: what ESTIMATOR_STATUS uses the bit for is a GPS glitch
+ARDUPILOT_UNINITIALISED = 1024  # EKF_STATUS_FLAGS; in ESTIMATOR_STATUS the bit means a GPS glitch
 HAS_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
 NAMES = {dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", dialect.MAV_AUTOPILOT_PX4: "px4"}
 EXTERNAL_NAV = re.compile(r"EKF\d IMU\d+ is using external nav data")
@@ -59,7 +59,7 @@ HEARD = {
 
 
 def unfit(message: StateMessage, limits: Autopilot) -> tuple[str, str] | None:
-    """Why a state is not to be sent: a word for the kind of reason, and the whole of it. None: it is fit."""
+    """Why a state must not be sent: the kind of reason in a word, and in full. None: it may be sent."""
     state = message.state
     if state is None or message.mode in (Mode.ALIGNING, Mode.LOST):
         return message.mode.value, message.fault or message.mode.value.replace("_", " ")
@@ -89,13 +89,13 @@ def quality(state: State, limits: Autopilot) -> int:
 
 
 class Readback:
-    """What the autopilot tells of its own estimator. `hear` is called by the link's thread."""
+    """The autopilot's reports on its own estimator. `hear` is called by the link's thread."""
 
     def __init__(self, link: MavlinkLink, kind: str) -> None:
         self.origin: Origin | None = None  # of its local frame; its height is above the sea
         self._link, self._kind = link, kind
         self._parser = dialect.MAVLink(None)
-        self._is = kind  # whose heartbeat it is
+        self._is = kind  # the kind that its heartbeat gives
         self._said_external: bool | None = None
         self._report: tuple[int, int, Sequence[float]] | None = None  # stamp, flags, ratios
 
@@ -106,7 +106,7 @@ class Readback:
         try:
             message = self._parser.decode(bytearray(frame))
         except dialect.MAVError:
-            return  # a dialect's message that shares the number, or a frame that was torn
+            return  # another dialect's message with this number, or a damaged frame
         if (message.get_srcSystem(), message.get_srcComponent()) != self._link.talk.target:
             return
         kind = message.get_msgId()
@@ -130,7 +130,7 @@ class Readback:
             self._report = t_ns, message.flags, ratios
 
     def verdict(self, now_ns: int) -> str:
-        """Does the autopilot use what it is sent? The first word is yes, no, likely or unknown."""
+        """Whether the autopilot uses the state. The first word is yes, no, likely or unknown."""
         if self._is != self._kind:
             return f"no: the autopilot says it is {self._is}, [autopilot] kind is {self._kind}"
         report = self._report
@@ -164,18 +164,18 @@ class AutopilotOutput:
         self._form = FORMS[self._settings.kind]
         self.outbox = Outbox(OUTBOX, (StateMessage,))
         self.about = f"{self._settings.message} to {self._settings.kind} over MAVLink {self._settings.link}"
-        self.pace, self._most_hz = Pace(self._settings.rate_hz), config.publish.rate_hz
+        self.pace, self._max_hz = Pace(self._settings.rate_hz), config.publish.rate_hz
         self.readback = Readback(link, self._settings.kind)
         self.origin: Origin | None = None  # of the local frame: the first fit position, kept
         self._counts = dict.fromkeys(("sent", "not fit", "stale", "link closed or full"), 0)
         self._unfit: tuple[str, str] | None = ("none", "no state yet")
         self._passed = True  # the link took the last one
-        self._told = "none"  # the kind of reason last told in a STATUSTEXT
+        self._told = "none"  # kind of reason in the last STATUSTEXT
         self._texts, self._next_text_ns, self._next_origin_ns = 0, 0, 0
 
     def session(self, stop: Event) -> None:
-        """Send what comes until told to stop. The link is opened and closed by its input: what comes meanwhile is lost
-        and counted."""
+        """Send states until `stop` is set. The link's input opens and closes it; states while it is closed are lost and
+        counted."""
         self._link.listeners.append(self.readback.hear)
         try:
             while not stop.is_set():
@@ -186,7 +186,7 @@ class AutopilotOutput:
             self._link.listeners.remove(self.readback.hear)
 
     def offer(self, message: StateMessage) -> None:
-        """Send a state, if it is fit and due; or else tell why not."""
+        """Send a state if it is fit and due; otherwise report why not."""
         if self._now() - message.t_ns > STALE_NS:
             self._counts["stale"] += 1
             return
@@ -213,7 +213,7 @@ class AutopilotOutput:
         return odometry(message, state, origin, self._form, quality(state, self._settings))
 
     def _tell(self, t_ns: int) -> None:
-        """In a STATUSTEXT, whether states are sent from now on; not more often than people can read."""
+        """Report in a STATUSTEXT whether states are sent from now on, no more often than people can read."""
         word = self._unfit[0] if self._unfit else ""
         if word == self._told or t_ns < self._next_text_ns:
             return
@@ -226,13 +226,13 @@ class AutopilotOutput:
 
     def parameter(self) -> Parameter:
         """Its rate, to be offered to a ground station."""
-        return Parameter("AP_RATE_HZ", lambda: self.pace.rate_hz, self._set_rate, LEAST_HZ, self._most_hz)
+        return Parameter("AP_RATE_HZ", lambda: self.pace.rate_hz, self._set_rate, MIN_HZ, self._max_hz)
 
     def _set_rate(self, rate_hz: float) -> None:
         self.pace.rate_hz = rate_hz
 
     def counts(self) -> dict[str, int]:
-        """What became of the states that were due; `not fit` are those that must not be sent."""
+        """Counts of the states that were due; `not fit` are those that must not be sent."""
         return dict(self._counts)
 
     def notes(self) -> dict[str, str]:

@@ -1,9 +1,9 @@
 """Telemetry for a ground station: position, velocity, attitude with their covariances, the estimator's status, events as
 texts, and answers to commands and parameter requests.
 
-It goes over a connection of its own, or over the open link of a MAVLink input, where the autopilot routes it. Nothing
-that would be taken for the autopilot's is sent under the vehicle's system id: the marker on the map is a vehicle with a
-system id of its own. Heartbeats are sent as long as states come from the estimator, and stop when they do.
+It uses a connection of its own, or the open link of a MAVLink input, where the autopilot routes it. No message that could
+be mistaken for the autopilot's carries the vehicle's system id: the marker on the map is a vehicle with a system id of its
+own. Heartbeats are sent while states come from the estimator.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from fusiond.events import GnssPosition, GnssVelocity, Payload, Pressure, WheelS
 from fusiond.messages.types import EventMessage, HealthMessage, Message, Severity, State, StateMessage
 from fusiond.ports.inputs import LiveInput
 from fusiond.ports.outputs import Outbox, OutputLost
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.answers import HANDLED, Parameter, Responder
 from fusiond_adapters.mavlink.decoder import NO_AUTOPILOT, Dialect, FrameSplitter, message_id
 from fusiond_adapters.mavlink.link import MavlinkLink, link_of
@@ -39,15 +40,14 @@ from fusiond_adapters.mavlink.outgoing import (
 )
 from fusiond_adapters.mavlink.transport import Transport, opener
 
-SECOND = 1_000_000_000  # ns
 OUTBOX = 256  # messages
-POLL_S = 0.05  # between two looks for what the ground station says
+POLL_S = 0.05  # between two looks for messages of the ground station
 HEARTBEAT_NS = SECOND
-ALIVE_NS = 2 * SECOND  # without a state for so long, no heartbeats
+ALIVE_NS = 2 * SECOND  # heartbeats end this long after the last state
 STATUS_HZ = 1.0
 MARKER_HZ = 2.0
-MOST_HEARD = 256  # frames that wait for an answer
-AUTOPILOT_COMPONENT = 1  # the only one of which QGroundControl makes a vehicle on the map
+MAX_HEARD = 256  # frames that wait for an answer
+AUTOPILOT_COMPONENT = 1  # the only one that QGroundControl shows as a vehicle on the map
 SEVERITY: dict[Severity, int] = {
     "critical": common.MAV_SEVERITY_CRITICAL,
     "warning": common.MAV_SEVERITY_WARNING,
@@ -65,11 +65,11 @@ ATTITUDE, ESTIMATOR = common.MAVLINK_MSG_ID_ATTITUDE_QUATERNION_COV, common.MAVL
 
 
 class Way(Protocol):
-    """To the ground station and back. `send` may raise OSError or EOFError where the way is this output's own."""
+    """The connection to the ground station. `send` may raise OSError or EOFError where it is this output's own."""
 
     @property
     def identity(self) -> tuple[int, int]:
-        """System and component we speak as."""
+        """Our system and component."""
 
     beats: bool  # heartbeats are ours to send
 
@@ -79,13 +79,13 @@ class Way(Protocol):
 
 
 class LinkWay:
-    """Over the open link of an input, whose own talk sends our heartbeats."""
+    """The open link of an input, which sends our heartbeats itself."""
 
     beats = False
 
     def __init__(self, link: MavlinkLink, rouse: Callable[[], None]) -> None:
         self._link, self._rouse = link, rouse
-        self._heard: deque[bytes] = deque(maxlen=MOST_HEARD)
+        self._heard: deque[bytes] = deque(maxlen=MAX_HEARD)
         self.send = link.send
         link.listeners.append(self._listen)
 
@@ -136,7 +136,7 @@ class OwnWay:
 
 
 class GroundStation:
-    """[ground_station]. `parameters` are offered besides its own. Raises ConfigError where the connection is none."""
+    """[ground_station]. `parameters` are offered besides its own. Raises ConfigError for a wrong connection string."""
 
     name = "ground_station"
 
@@ -149,7 +149,7 @@ class GroundStation:
     ) -> None:
         self._config, self._settings = config, config.ground_station
         self._geoid_m = config.vehicle.geoid_m
-        self._links = [link_of(inputs, name) for name in config.mavlink]
+        self._links = [link_of(inputs, name) for name in config.mavlink if f"mavlink.{name}" in inputs]  # none in a replay
         self._now = now
         self.outbox = Outbox(OUTBOX, (StateMessage, HealthMessage, EventMessage))
         self._open = self._opener()
@@ -169,7 +169,7 @@ class GroundStation:
         self._counts = dict.fromkeys(("sent", "lost", "texts", "requests"), 0)
 
     def session(self, stop: Event) -> None:
-        """Send what comes, answer what is asked, until told to stop. Raises OutputLost."""
+        """Send messages and answer requests until `stop` is set. Raises OutputLost."""
         try:
             way = self._open()
         except OSError as error:
@@ -240,7 +240,7 @@ class GroundStation:
             self._send(way, attitude_quaternion(message, state))
 
     def _due(self, number: int, t_ns: int) -> bool:
-        """Is a message due by its pace, or asked for?"""
+        """Whether a message is due by its pace, or was requested."""
         due = self.paces[number].due(t_ns)
         if number in self._responder.requested:
             self._responder.requested.discard(number)
@@ -296,7 +296,7 @@ class GroundStation:
         return dict(self._counts)
 
     def notes(self) -> dict[str, str]:
-        """Nothing: the counts tell it all."""
+        """None: the counts say everything."""
         return {}
 
 

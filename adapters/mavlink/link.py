@@ -1,34 +1,34 @@
-"""MAVLink live: one link's thread, from a transport to frames in the inbox, and back what fusiond has to say."""
+"""The live input of one MAVLink link: frames from a transport into the inbox, and messages of fusiond back."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from threading import Event, Lock
 from typing import Any
 
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.events import Received
-from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput
-from fusiond_adapters.host.clock import HostClock
-from fusiond_adapters.logs.tlog import STAMP
-from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder
+from fusiond.ports.clock import Clock
+from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput, Receiver
+from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder, message_id
 from fusiond_adapters.mavlink.talk import MavlinkTalk
+from fusiond_adapters.mavlink.tlog_record import tlog_record
 from fusiond_adapters.mavlink.transport import Transport, opener
 
 log = logging.getLogger("fusiond")
 
 
 class MavlinkLink:
-    """One [mavlink.NAME]. `alive` tells whether the estimator works: only then are heartbeats sent. `listeners` are
-    called with every frame that comes in and its stamp, in the link's thread: they must not wait.
+    """One [mavlink.NAME]. `alive` says whether the estimator works: only then are heartbeats sent. `listeners` are called
+    with every received frame and its stamp, in the link's thread: they must not wait.
 
-    Raises ConfigError where the connection string is none, or the dialect lacks a wanted message.
+    Raises ConfigError for a wrong connection string, or where the dialect lacks a wanted message.
     """
 
     def __init__(
-        self, config: Config, link: str, inbox: Inbox[bytes], clock: HostClock, alive: Callable[[], bool]
+        self, config: Config, link: str, inbox: Inbox[bytes], clock: Clock, alive: Callable[[], bool]
     ) -> None:
         self.name = link
         self.file = f"{link}.tlog"
@@ -37,12 +37,12 @@ class MavlinkLink:
         self.listeners: list[Callable[[bytes, int], None]] = []
         self.sessions = self.skipped_bytes = self.sent = 0
         self._clock, self._alive = clock, alive
-        self._sending = Lock()  # guards the way out: what is packed next, and the transport while it is written to
+        self._sending = Lock()  # guards packing, and the transport while it is written to
         self._transport: Transport | None = None
         self.configure(config)
 
     def configure(self, config: Config) -> None:
-        """Take connection, own ids and requests of a configuration, for the sessions to come. Raises ConfigError."""
+        """Use connection, own ids and requests of a configuration from the next session on. Raises ConfigError."""
         settings = config.mavlink[self.name]
         try:
             self._open = opener(settings.connection, settings.baud)
@@ -52,10 +52,10 @@ class MavlinkLink:
         self.talk = MavlinkTalk(config, self.name)
 
     def prepare(self) -> None:
-        """Nothing takes long."""
+        """Nothing to load."""
 
     def session(self, stop: Event) -> None:
-        """Open the link, read it until told to stop, close it. Raises InputLost."""
+        """Open the link, read it until `stop` is set, close it. Raises InputLost."""
         try:
             transport = self._open()
         except OSError as error:
@@ -72,8 +72,8 @@ class MavlinkLink:
                 transport.close()
 
     def send(self, message: Any, voice: Any = None) -> bool:
-        """Send a pymavlink message, from any thread, as fusiond or with a voice (a pymavlink MAVLink) of one's own. Never
-        waits for the peer. False: the link is closed or takes nothing more, and the message is lost."""
+        """Send a pymavlink message, from any thread, as fusiond or as another sender (`voice`, a pymavlink MAVLink). Never
+        waits for the peer. False: the link is closed or full, and the message is lost."""
         with self._sending:
             if self._transport is None:
                 return False
@@ -112,15 +112,25 @@ class MavlinkLink:
 
     def record(self, item: bytes, t_ns: int) -> bytes:
         """A record of a .tlog."""
-        return STAMP.pack(t_ns // 1000) + item
+        return tlog_record(item, t_ns)
 
     def counts(self) -> dict[str, int]:
-        """What became of the frames so far, and of the link."""
+        """Counts of frames and of the link so far."""
         own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
         asked = {f"asked for {name}": wanted.asked for name, wanted in self.talk.wanted.items()}
         rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.talk.wanted.items()}
         signing = self.talk.signing.counts if self.talk.signing else {}
         return {**own, "reboots": self.talk.reboots, **asked, **rates, **signing, **self.decoder.counts}
+
+
+def make(config: Config, receiver: Receiver) -> Sequence[LiveInput[Any]]:
+    """The link of each [mavlink.NAME]."""
+
+    def link(name: str) -> MavlinkLink:
+        inbox: Inbox[bytes] = Inbox(config.live.queue_frames, receiver.wake, message_id)
+        return MavlinkLink(config, name, inbox, receiver.clock, receiver.is_alive)
+
+    return [link(name) for name in config.mavlink]
 
 
 def link_of(inputs: Mapping[str, LiveInput[Any]], name: str) -> MavlinkLink:

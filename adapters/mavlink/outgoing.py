@@ -1,13 +1,13 @@
 """The state as MAVLink messages: for an autopilot's estimator, for a ground station, and texts for people. No I/O.
 
-Positions are told from an origin that stays where it is. North and east are metres on the map that the receiver itself
-uses to get latitude and longitude out of metres again: ArduPilot's and PX4's spheres differ from the ellipsoid by up to
-3 m a kilometre, and what counts is that they end at the latitude and longitude of the state. Down is the difference of
-heights, not a tangent plane's third axis, which at 10 km lies 8 m off. Velocity and attitude are those in north-east-down
-at the vehicle. `frames` has the tangent plane for those who ask for one.
+Positions are relative to a fixed origin. North and east are metres on the map that the receiver itself uses to convert
+metres back to latitude and longitude: ArduPilot's and PX4's spheres differ from the ellipsoid by up to 3 m per kilometre,
+and the receiver must end at the latitude and longitude of the state. Down is the difference of heights, not the third axis
+of a tangent plane, which at 10 km is off by 8 m. Velocity and attitude are in north-east-down at the vehicle.
+`fusiond.messages.local_frame` has the tangent plane.
 
-Angles in covariances are small errors of roll, pitch and yaw, as MAVLink has it, not rotations about north, east, down.
-The state tells no correlation between position, velocity and attitude: such elements are zero.
+Angles in covariances are small errors of roll, pitch and yaw, as MAVLink defines them, not rotations about north, east,
+down. The state has no correlation between position, velocity and attitude: such elements are zero.
 
 Stamps are those of the state: Unix time on the host's time line, the clock that answers TIMESYNC. PX4 converts stamps by
 its TIMESYNC offset (mavlink_receiver.cpp, Timesync.cpp), ArduPilot by the least lag it sees (JitterCorrection.cpp): both
@@ -28,6 +28,7 @@ from fusiond.estimator.solution import Mode
 from fusiond.maths.rotation import matrix
 from fusiond.maths.wgs84 import normal_gravity, radii
 from fusiond.messages.types import Block, State, StateMessage
+from fusiond.units import MICROSECOND, MILLISECOND
 
 Array = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ class Form(NamedTuple):
 
 
 FORMS = {
-    # anything but this pair of frames is dropped without a word (GCS_Common.cpp, handle_odometry)
+    # any other pair of frames is dropped silently (GCS_Common.cpp, handle_odometry)
     "ardupilot": Form(common.MAV_FRAME_LOCAL_FRD, ardupilot_map),
     # LOCAL_FRD is taken as well, but as a frame of arbitrary heading (mavlink_receiver.cpp, VehicleOdometry.msg)
     "px4": Form(common.MAV_FRAME_LOCAL_NED, px4_map),
@@ -116,9 +117,9 @@ def odometry(message: StateMessage, state: State, origin: Origin, form: Form, qu
     """ODOMETRY: pose in the local frame, velocity and angular rate in body axes. `quality` is 1 to 100."""
     mat_nb = matrix(np.array(state.quaternion_nb))
     twist = mat_nb.T @ _square(state.covariance_velocity_m2ps2) @ mat_nb
-    rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # all that is known of them
+    rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # no more is known of them
     return common.MAVLink_odometry_message(
-        message.t_ns // 1000, form.local_frame, common.MAV_FRAME_BODY_FRD,
+        message.t_ns // MICROSECOND, form.local_frame, common.MAV_FRAME_BODY_FRD,
         *local_position(state, origin, form.on), list(state.quaternion_nb),
         *(mat_nb.T @ state.velocity_ned_mps).tolist(), *state.angular_rate_b_rps,
         _upper(_square(state.covariance_position_m2), _euler_covariance(state)), _upper(twist, rates),
@@ -129,17 +130,18 @@ def vision_position(message: StateMessage, state: State, origin: Origin, form: F
     """VISION_POSITION_ESTIMATE."""
     covariance = _upper(_square(state.covariance_position_m2), _euler_covariance(state))
     return common.MAVLink_vision_position_estimate_message(
-        message.t_ns // 1000, *local_position(state, origin, form.on), *_euler(state), covariance, message.resets & 0xFF
+        message.t_ns // MICROSECOND, *local_position(state, origin, form.on), *_euler(state), covariance,
+        message.resets & 0xFF,
     )
 
 
 def gps_input(message: StateMessage, state: State, geoid_m: float, gps_id: int) -> Any:
     """GPS_INPUT, as of a receiver with two antennas. Its dilutions of precision are the sigmas of position, at 1 m each."""
-    week, week_ms = divmod(message.t_ns // 10**6 + (LEAP_SECONDS - GPS_EPOCH_S) * 1000, WEEK_MS)
+    week, week_ms = divmod(message.t_ns // MILLISECOND + (LEAP_SECONDS - GPS_EPOCH_S) * 1000, WEEK_MS)
     north, east, down = state.sigma_position_ned_m
     horizontal = max(north, east)
     return common.MAVLink_gps_input_message(
-        message.t_ns // 1000, gps_id, 0, week_ms, week, 3,
+        message.t_ns // MICROSECOND, gps_id, 0, week_ms, week, 3,
         _e7(state.lat_deg), _e7(state.lon_deg), state.height_m - geoid_m, horizontal, down,
         *state.velocity_ned_mps, state.sigma_velocity_mps, horizontal, down, ASSUMED_SATELLITES,
         round(state.yaw_deg % 360 * 100) or NORTH_CDEG)  # fmt: skip
@@ -149,7 +151,7 @@ def set_origin(message: StateMessage, origin: Origin, geoid_m: float, system: in
     """SET_GPS_GLOBAL_ORIGIN."""
     height_mm = round((origin.height_m - geoid_m) * 1e3)
     return common.MAVLink_set_gps_global_origin_message(
-        system, _e7(origin.latitude_deg), _e7(origin.longitude_deg), height_mm, message.t_ns // 1000
+        system, _e7(origin.latitude_deg), _e7(origin.longitude_deg), height_mm, message.t_ns // MICROSECOND
     )
 
 
@@ -163,7 +165,7 @@ def global_position(message: StateMessage, state: State, origin: Origin, geoid_m
     covariance[:3, :3] = up @ _square(state.covariance_position_m2) @ up
     covariance[3:, 3:] = _square(state.covariance_velocity_m2ps2)
     return common.MAVLink_global_position_int_cov_message(
-        message.t_ns // 1000, common.MAV_ESTIMATOR_TYPE_GPS_INS, _e7(state.lat_deg), _e7(state.lon_deg),
+        message.t_ns // MICROSECOND, common.MAV_ESTIMATOR_TYPE_GPS_INS, _e7(state.lat_deg), _e7(state.lon_deg),
         round((state.height_m - geoid_m) * 1e3), round((state.height_m - origin.height_m) * 1e3),
         *state.velocity_ned_mps, covariance.ravel().tolist())  # fmt: skip
 
@@ -176,19 +178,20 @@ def local_position_ned(message: StateMessage, state: State, origin: Origin) -> A
     bias = mat_nb @ np.diag(np.square(state.sigma_accel_bias_mps2)) @ mat_nb.T
     blocks = (_square(state.covariance_position_m2), _square(state.covariance_velocity_m2ps2), bias)
     return common.MAVLink_local_position_ned_cov_message(
-        message.t_ns // 1000, common.MAV_ESTIMATOR_TYPE_GPS_INS, *local_position(state, origin, ellipsoid_map),
+        message.t_ns // MICROSECOND, common.MAV_ESTIMATOR_TYPE_GPS_INS, *local_position(state, origin, ellipsoid_map),
         *state.velocity_ned_mps, *acceleration_n.tolist(), _upper(*blocks))  # fmt: skip
 
 
 def attitude_quaternion(message: StateMessage, state: State) -> Any:
     """ATTITUDE_QUATERNION_COV."""
     return common.MAVLink_attitude_quaternion_cov_message(
-        message.t_ns // 1000, list(state.quaternion_nb), *state.angular_rate_b_rps, _euler_covariance(state).ravel().tolist()
+        message.t_ns // MICROSECOND, list(state.quaternion_nb), *state.angular_rate_b_rps,
+        _euler_covariance(state).ravel().tolist(),
     )
 
 
 class Ratios(NamedTuple):
-    """Innovations over their gates, the greatest of the sources; not a number where there is none."""
+    """Largest ratio of innovation to gate over the sources; not a number where there is none."""
 
     velocity: float = math.nan
     horizontal: float = math.nan
@@ -207,7 +210,7 @@ def estimator_status(message: StateMessage, ratios: Ratios) -> Any:
         if message.mode is not Mode.LOST:
             flags |= common.ESTIMATOR_POS_HORIZ_ABS | common.ESTIMATOR_POS_VERT_ABS | common.ESTIMATOR_PRED_POS_HORIZ_ABS
     return common.MAVLink_estimator_status_message(
-        message.t_ns // 1000, flags, *ratios, math.nan, math.nan, math.nan, horizontal, vertical
+        message.t_ns // MICROSECOND, flags, *ratios, math.nan, math.nan, math.nan, horizontal, vertical
     )
 
 
@@ -216,13 +219,13 @@ def marker(message: StateMessage, state: State, origin: Origin, geoid_m: float) 
     autopilot's."""
     velocity = [round(component * 100) for component in state.velocity_ned_mps]
     return common.MAVLink_global_position_int_message(
-        message.t_ns // 10**6 & 0xFFFFFFFF, _e7(state.lat_deg), _e7(state.lon_deg),
+        message.t_ns // MILLISECOND & 0xFFFFFFFF, _e7(state.lat_deg), _e7(state.lon_deg),
         round((state.height_m - geoid_m) * 1e3), round((state.height_m - origin.height_m) * 1e3),
         *velocity, round(state.yaw_deg % 360 * 100) % NORTH_CDEG)  # fmt: skip
 
 
 def status_texts(severity: int, text: str, number: int) -> Iterator[Any]:
-    """STATUSTEXT, in as many chunks as it takes. `number`, from 1 to 65535, tells the chunks of one text from others'.
+    """STATUSTEXT, in as many chunks as needed. `number`, from 1 to 65535, marks the chunks of one text.
 
     A chunk with a zero in it is the last: where the text fills all of them, an empty one follows.
     """
@@ -238,7 +241,7 @@ def status_texts(severity: int, text: str, number: int) -> Iterator[Any]:
 
 
 class Pace:
-    """Lets through so many a second of what comes, by its stamps."""
+    """Thins messages to a rate, by their stamps."""
 
     def __init__(self, rate_hz: float) -> None:
         """0: none."""
@@ -246,7 +249,7 @@ class Pace:
         self._due_ns: int | None = None
 
     def due(self, t_ns: int) -> bool:
-        """Is one due at this instant? If so, it counts as passed."""
+        """Whether a message is due at this instant; if so, it counts as sent."""
         if self.rate_hz <= 0 or (self._due_ns is not None and t_ns < self._due_ns):
             return False
         period = round(1e9 / self.rate_hz)

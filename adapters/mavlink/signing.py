@@ -1,7 +1,7 @@
-"""MAVLink 2 signing: one key, frames signed and frames checked, and a timestamp that never falls, over restarts either.
+"""MAVLink 2 signing: frames signed and checked with one key, and a timestamp that never falls, not even over a restart.
 
-Timestamps count 10 us since 2015. What is on disk is ahead of what was sent: it is written anew, a minute ahead, before
-it is reached. So a start after a crash, or with a wall clock that was set back, begins beyond everything sent before.
+Timestamps count 10 us since 2015. The one on disk is ahead of those sent: it is rewritten, a minute ahead, before it is
+reached. So a start after a crash, or with a wall clock that was set back, begins after everything sent before.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import Any
 
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.decoder import CHECKSUM, HEADER_2, MAGIC_2, SIGNED
 
 KEY_SIZE = 32  # bytes
 SIGNATURE_SIZE, DIGEST_SIZE = 13, 6  # bytes: link, timestamp (6), digest (6)
-EPOCH_NS = 1_420_070_400 * 10**9  # 2015
+EPOCH_NS = 1_420_070_400 * SECOND  # 2015
 TICK_NS = 10_000
-MINUTE = 60 * 10**9 // TICK_NS  # in timestamps
+MINUTE = 60 * SECOND // TICK_NS  # in timestamps
 LONGEST_FILE = 100  # characters of a timestamp file
 
 
@@ -48,7 +49,7 @@ class Signing:
         voice.signing.timestamp = self._last
 
     def accepts(self, frame: bytes) -> bool:
-        """Is a frame signed with the key, and newer than those before it, or may it be unsigned? If not, it is counted."""
+        """Whether a frame is signed with the key and newer than those before it, or may be unsigned. Counts the others."""
         if frame[0] != MAGIC_2 or not frame[2] & SIGNED:
             self.counts["unsigned"] += not self._accept_unsigned
             return self._accept_unsigned
@@ -71,7 +72,7 @@ class Signing:
         return True
 
     def _keep(self, timestamp: int) -> None:
-        """Write the timestamp that a restart begins from; the old one or the new one stands on disk, nothing between."""
+        """Write the timestamp that a restart begins from, atomically."""
         new = self._file.with_name(self._file.name + ".new")
         try:
             with new.open("w", encoding="ascii") as file:
@@ -80,7 +81,7 @@ class Signing:
                 os.fsync(file.fileno())
             new.replace(self._file)
         except OSError:
-            self.counts["timestamp not kept"] += 1  # the disk is full or read-only: what is sent must go on
+            self.counts["timestamp not kept"] += 1  # the disk is full or read-only: sending must go on
         self._kept = timestamp
 
 

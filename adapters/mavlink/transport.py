@@ -1,6 +1,6 @@
-"""Byte transports of MAVLink links, by pymavlink's connection strings. Nothing is printed, no loss goes unnoticed.
+"""Byte transports of MAVLink links, by pymavlink's connection strings. They print nothing, and every loss is noticed.
 
-    udpin:HOST:PORT     listen; answers go to whoever was heard within the last minute (udp:HOST:PORT is the same)
+    udpin:HOST:PORT     listen; answers go to every peer heard within the last minute (udp:HOST:PORT is the same)
     udpout:HOST:PORT    send there first, hear what comes back
     udpbcast:HOST:PORT  likewise, to a broadcast address
     tcp:HOST:PORT       connect
@@ -8,7 +8,7 @@
     uds:PATH            connect to a Unix domain socket (unix:PATH is the same)
     DEVICE[,BAUD]       a serial line
 
-pymavlink's own classes are of no use here: they print, sleep, take the end of a stream for silence and swallow errors.
+pymavlink's own classes print, sleep, mistake the end of a stream for silence and swallow errors.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ import serial
 
 CHUNK = 65536  # bytes read at a time; no UDP datagram is longer
 CONNECT_TIMEOUT_S = 5.0
-FORGET_S = 60.0  # a UDP peer unheard for so long gets no more answers
-MOST_PEERS = 16
+FORGET_S = 60.0  # a UDP peer that is silent for this long gets no more answers
+MAX_PEERS = 16
 
 
 class Transport(Protocol):
-    """An open way to a peer. Every method may raise OSError or EOFError: the way is lost. One thread may read while
-    another writes; two must not write at once, nor one write to what is being closed."""
+    """An open connection to a peer. Every method may raise OSError or EOFError: the connection is lost. One thread may read
+    while another writes; two must not write at once, and none may write while it is being closed."""
 
     def read(self, timeout_s: float) -> list[bytes]:
-        """What has come, after waiting for it up to `timeout_s`."""
+        """The bytes received, after waiting for them up to `timeout_s`."""
 
     def write(self, data: bytes) -> bool:
-        """Send a frame to the peer. False: it is lost, as there is no peer or the line takes nothing more. Never waits."""
+        """Send a frame to the peer. False: there is no peer or the line is full, and the frame is lost. Never waits."""
 
     def close(self) -> None: ...
 
 
 def opener(connection: str, baud: int) -> Callable[[], Transport]:
-    """What opens the transport that a connection string names; it raises OSError where that fails. Raises ValueError
-    where the string names none."""
+    """A function that opens the transport of a connection string; it raises OSError. Raises ValueError for a wrong
+    string."""
     scheme, colon, rest = connection.partition(":")
     if scheme in ("uds", "unix"):
         return lambda: _Stream(_unix_socket(rest))
@@ -77,7 +77,7 @@ def _unix_socket(path: str) -> socket.socket:
 
 
 class Whole:
-    """Frames on a line that may take a part of one: the rest of it goes first the next time, so that none is torn."""
+    """Frames on a line that may take only a part of one: the rest is sent first the next time, so frames stay whole."""
 
     def __init__(self, write: Callable[[bytes], int]) -> None:
         """`write` gives how many bytes the line took. It may raise BlockingIOError: none."""
@@ -85,7 +85,7 @@ class Whole:
         self._rest = b""
 
     def put(self, data: bytes) -> bool:
-        """Was the frame taken?"""
+        """Write a frame. Whether it was taken."""
         try:
             if self._rest:
                 self._rest = self._rest[self._write(self._rest) :]
@@ -102,7 +102,7 @@ def _wait(sockets: list[socket.socket], timeout_s: float) -> list[socket.socket]
 
 
 class _Udp:
-    """What both directions of UDP share: all datagrams that are there are read at once."""
+    """Both kinds of UDP: all waiting datagrams are read at once."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -146,7 +146,7 @@ class _UdpIn(_Udp):
         received = self.receive(timeout_s)
         now = time.monotonic()
         for _, peer in received:
-            if peer in self._peers or len(self._peers) < MOST_PEERS:
+            if peer in self._peers or len(self._peers) < MAX_PEERS:
                 self._peers[peer] = now
         return [data for data, _ in received]
 
@@ -202,7 +202,8 @@ class _Stream:
 
 
 class _TcpIn:
-    """A listening socket and its latest peer. A peer that goes is waited for; only the listener's loss is a loss."""
+    """A listening socket and its latest peer. When the peer goes, it waits for the next; only the loss of the listener is
+    an error."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._listener = socket.create_server(address, backlog=1)

@@ -1,4 +1,4 @@
-"""ROS 2 messages in CDR: those that are sent often are made once, after which only their numbers are put in place."""
+"""ROS 2 messages in CDR: frequent messages are packed once, and afterwards only their numbers are replaced."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from fusiond.messages.local_frame import LocalState, Placed
 from fusiond.messages.types import Block, Quaternion, Triple
+from fusiond.units import SECOND
 
-SECOND = 1_000_000_000  # ns
 ODOMETRY = "nav_msgs/msg/Odometry"
 FIX = "sensor_msgs/msg/NavSatFix"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
@@ -62,7 +62,7 @@ def _twist() -> Any:
 
 
 class Template:
-    """The bytes of a message, but for its stamps and its numbers (64-bit floats that follow one another)."""
+    """The bytes of a message without its stamps and its numbers (consecutive 64-bit floats)."""
 
     def __init__(self, message: Any, numbers: int, behind: int = 0) -> None:
         """`numbers` is how many stand together, `behind` how many bytes come after them."""

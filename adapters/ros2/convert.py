@@ -9,10 +9,10 @@ from fusiond.config.schema import Ros2
 from fusiond.estimator.solution import Mode
 from fusiond.messages.local_frame import LocalFrame, OdometryFrame
 from fusiond.messages.types import HealthMessage, InputHealth, OutputHealth, SourceHealth, State, StateMessage
+from fusiond.units import SECOND
 from fusiond_adapters.ros2 import cdr
 from fusiond_adapters.ros2.cdr import ERROR, OK, WARN, Status
 
-SECOND = 1_000_000_000  # ns
 FIT = (Mode.NOMINAL, Mode.DEAD_RECKONING)
 LEVELS = {Mode.NOMINAL: OK, Mode.DEAD_RECKONING: WARN, Mode.ALIGNING: WARN, Mode.LOST: ERROR}
 RESET_SHOWN_NS = 5 * SECOND  # how long the diagnostics warn of a reset
@@ -29,7 +29,7 @@ class Converter:
     """One vehicle. Its origin and its odometry frame last as long as it does."""
 
     def __init__(self, section: Ros2) -> None:
-        self.unfit = 0  # states that were not sent, as there is none or it is not to be used
+        self.unfit = 0  # messages without a usable state, which are not sent
         self._section = section
         self._frame: LocalFrame | None = None
         if section.origin is not None:
@@ -58,7 +58,7 @@ class Converter:
         return f"{math.degrees(latitude):.9f}, {math.degrees(longitude):.9f}, {height:.3f}"
 
     def state(self, message: StateMessage) -> Iterator[tuple[str, bytes]]:
-        """Topic and CDR of what a state is told by; nothing between turns, and nothing of a state that is not fit."""
+        """Topic and CDR of each message of a state; none while it is not due, and none of a state that is not fit."""
         slot = int(message.t_ns // self._period_ns)
         if slot == self._slot:
             return

@@ -6,7 +6,7 @@ A Zenoh session of its own, by default a client of the router that rmw_zenoh nee
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from threading import Event
 
 import zenoh
@@ -15,7 +15,7 @@ from fusiond.config.schema import Config, Ros2
 from fusiond.config.schema import Zenoh as ZenohSection
 from fusiond.config.toml import ConfigError
 from fusiond.messages.types import HealthMessage, Message, StateMessage
-from fusiond.ports.outputs import POLL_S, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
 from fusiond_adapters.zenoh.session import PublishError, open_session
 
 try:
@@ -25,9 +25,9 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[ros2] needs the extra ros2: pip install 'fusiond[ros2]'") from missing
 
-MOST_WAITING = 64  # messages between the estimator and the session: new ones are worth more
+MAX_WAITING = 64  # messages between the estimator and the session; the oldest are dropped
 TF_DEPTH = 100  # what tf2's own broadcasters keep
-CHECK_S = 1.0  # how often the router is looked for
+CHECK_S = 1.0  # between two checks of the router
 
 
 def topics(section: Ros2) -> Iterator[tuple[str, Topic]]:
@@ -47,21 +47,21 @@ class Ros2Output:
     def __init__(self, config: Config) -> None:
         self._section, self._directory = config.ros2, config.directory
         self.about = f"ROS 2 in domain {self._section.domain} by {', '.join(self._section.connect) or 'listening'}"
-        self.outbox = Outbox(MOST_WAITING, (StateMessage, HealthMessage))
+        self.outbox = Outbox(MAX_WAITING, (StateMessage, HealthMessage))
         self._converter = Converter(self._section)
         self._publishers: Mapping[str, Publisher] = {}  # those of the session
         self._sent = 0
 
     def session(self, stop: Event) -> None:
-        """Open, publish until told to stop, close. Raises OutputLost."""
-        section = self._section
+        """Open, publish until `stop` is set, close. Raises OutputLost."""
+        section, lossless = self._section, self.outbox.patience_s > 0
         zenoh_section = ZenohSection(
             mode=section.mode, listen=section.listen, connect=section.connect, config_file=section.config_file
         )
         try:
             with (
                 open_session(zenoh_section, self._directory) as session,
-                Node(session, section.domain, section.namespace, section.node) as node,
+                Node(session, section.domain, section.namespace, section.node, lossless=lossless) as node,
             ):
                 self._publishers = {name: node.publisher(topic) for name, topic in topics(section)}
                 self._publish(session, stop)
@@ -69,11 +69,11 @@ class Ros2Output:
             raise OutputLost(str(error)) from error
 
     def counts(self) -> dict[str, int]:
-        """What became of the messages so far."""
+        """Messages so far, counted by what was done with them."""
         return {"sent": self._sent, "states unfit": self._converter.unfit}
 
     def notes(self) -> dict[str, str]:
-        """What else there is to tell."""
+        """Notes for the health."""
         return {"origin": self._converter.origin}
 
     def _publish(self, session: zenoh.Session, stop: Event) -> None:
@@ -101,3 +101,8 @@ class Ros2Output:
 
 def _connected(session: zenoh.Session) -> bool:
     return bool(session.info.routers_zid() or session.info.peers_zid())
+
+
+def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+    """The output of a configuration."""
+    return [Ros2Output(config)]

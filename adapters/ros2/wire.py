@@ -80,16 +80,20 @@ class Publisher:
         self._sequence = 0
 
     def put(self, payload: bytes) -> None:
-        """Send a CDR message. Never waits. Raises zenoh.ZError where the session is closed."""
+        """Send a CDR message. Raises zenoh.ZError where the session is closed."""
         self._sequence += 1
         attachment = ATTACHMENT.pack(self._sequence, time.time_ns(), GID_SIZE, self._gid)
         self._publisher.put(payload, attachment=attachment)
 
 
 class Node:
-    """A node in the ROS graph. A context manager that must end before its session. Raises zenoh.ZError."""
+    """A node in the ROS graph. A context manager that must end before its session. Raises zenoh.ZError.
 
-    def __init__(self, session: zenoh.Session, domain: int, namespace: str, name: str) -> None:
+    With `lossless` its publishers wait for readers that do not keep up; else they drop what finds no room on its way.
+    """
+
+    def __init__(self, session: zenoh.Session, domain: int, namespace: str, name: str, *, lossless: bool = False) -> None:
+        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         self._session, self._domain, self._namespace, self._name = session, domain, namespace, name
         self._zid = str(session.info.zid())
         self._entities = 0  # so far; the node itself is number 0
@@ -103,7 +107,7 @@ class Node:
         publisher = self._declared.enter_context(
             self._session.declare_publisher(
                 topic_key(self._domain, topic),
-                congestion_control=zenoh.CongestionControl.DROP,
+                congestion_control=self._congestion,
                 priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA,
                 express=False,  # the topics of one instant go in one batch; two batches wait at the most, others are dropped
             )

@@ -1,7 +1,7 @@
 """Answers to Zenoh queries: the latest message of every kind, and the state at an instant within the horizon.
 
-They come from messages that were published, kept here; the filter is never touched. `fusiond/<vehicle>/state?t_ns=...`
-gives the state published nearest to that instant: what the filter knew then, not what late measurements have taught since.
+They come from published messages that are kept here, never from the filter. `fusiond/<vehicle>/state?t_ns=...`
+gives the state published nearest to that instant, as the filter knew it then.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from threading import Lock
 import zenoh
 
 from fusiond.config.schema import Config
+from fusiond.messages.codec import encode
 from fusiond.messages.keys import key as key_of
-from fusiond.messages.types import Message, StateMessage, encode
+from fusiond.messages.types import Message, StateMessage
+from fusiond.units import SECOND
 from fusiond_adapters.zenoh.session import CONTENT_TYPES, message_key
-
-SECOND = 1_000_000_000  # ns
 
 
 class Answers:

@@ -1,8 +1,8 @@
-"""Zenoh: a session that keeps to itself unless told otherwise, and the publishers of all messages.
+"""Zenoh: a session on loopback unless configured otherwise, and the publishers of all messages.
 
-A session hears and speaks on loopback only, by default: no multicast scouting, no gossip, no listener on other
-interfaces. Publishing hardly waits. Streams (state, settled, innovations) lose samples when a reader cannot keep up. What is
-told seldom (health, events, info, config) is kept here: readers that find one missing, or come late, fetch it.
+By default a session uses loopback only: no multicast scouting, no gossip, no listener on other interfaces. Publishing
+waits hardly at all. Streams (state, settled, innovations) lose samples when a reader cannot keep up. Rare messages
+(health, events, info, config) are kept here; readers that miss one or connect later fetch it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ import zenoh.ext
 
 from fusiond.config.schema import Encoding
 from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.messages.codec import encode
 from fusiond.messages.keys import key as key_of
-from fusiond.messages.types import MESSAGES, InnovationMessage, Message, encode
+from fusiond.messages.types import MESSAGES, InnovationMessage, Message
 
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
-KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples for those who missed them
+KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples kept for readers that missed them
 RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting: Zenoh's own is 1 to 4 s
 QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
 PATIENCE_US = 1000  # with which a sample waits for room there, as Zenoh has it
@@ -97,7 +98,7 @@ def _from_file(path: Path) -> zenoh.Config:
 
 @contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn Zenoh's error into ours: what was asked, and the reason without the places in Zenoh's own source."""
+    """Turn Zenoh's error into ours: what was tried, and the reason without locations in Zenoh's source."""
     try:
         yield
     except zenoh.ZError as error:
@@ -106,13 +107,15 @@ def _explained(what: str) -> Iterator[None]:
 
 
 class ZenohPublisher:
-    """Publishes messages of all kinds, and a liveliness token that tells readers as long as it does.
+    """Publishes messages of all kinds, and a liveliness token as long as it exists.
 
-    A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared.
+    A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared. With
+    `lossless` it waits for readers that do not keep up (Zenoh leaves those that take nothing for 5 s), and drops nothing.
     """
 
-    def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding) -> None:
+    def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding, *, lossless: bool = False) -> None:
         self.vehicle = vehicle
+        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         self._session, self._encoding = session, encoding
         self._publishers: dict[str, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}  # by key
         self._closed = False
@@ -124,18 +127,22 @@ class ZenohPublisher:
             self._declared = declared.pop_all()
 
     def _declare(self, where: str, kind: str, declared: ExitStack) -> None:
-        encoding, drop = zenoh.Encoding(CONTENT_TYPES[self._encoding]), zenoh.CongestionControl.DROP
+        encoding, congestion = zenoh.Encoding(CONTENT_TYPES[self._encoding]), self._congestion
         publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
         if kind in STREAMS:
             publisher = self._session.declare_publisher(
-                where, encoding=encoding, congestion_control=drop, priority=PRIORITY[kind], express=kind != "innovations"
+                where,
+                encoding=encoding,
+                congestion_control=congestion,
+                priority=PRIORITY[kind],
+                express=kind != "innovations",
             )
         else:
             publisher = zenoh.ext.declare_advanced_publisher(
                 self._session,
                 where,
                 encoding=encoding,
-                congestion_control=drop,
+                congestion_control=congestion,
                 cache=zenoh.ext.CacheConfig(KEPT[kind]),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=TELL_LAST_S),
                 publisher_detection=True,
@@ -151,7 +158,7 @@ class ZenohPublisher:
         return bool(status.matching)
 
     def publish(self, message: Message) -> None:
-        """Send a message to whoever subscribes. Raises PublishError where the session is closed."""
+        """Send a message to all subscribers. Raises PublishError where the session is closed."""
         where = message_key(message, self.vehicle)
         payload = encode(message, self._encoding)
         if self._closed:

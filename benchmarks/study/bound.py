@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.study.runs import start_covariance, true_state
 from benchmarks.study.world import WHEEL_PHASE_S, World
 from fusiond.config.schema import Config
+from fusiond.filter.motion_constraints import NON_HOLONOMIC
 from fusiond.filter.observations import CONSTRAINTS, IMU, MODEL, MODELS
 from fusiond.filter.observations.model import Observation, with_rate_noise
 from fusiond.filter.parameters import plan
@@ -78,7 +79,7 @@ def carried(p: Array, f: Array, density: Array, dt: float) -> Array:
 
 
 def updated(p: Array, seen: Observation) -> Array:
-    _, jacobian, variance = seen
+    _, jacobian, variance = seen.trimmed()
     across = p @ jacobian.T
     gain = np.linalg.solve(jacobian @ across + np.diag(variance), across.T).T
     keep = np.eye(len(p)) - gain @ jacobian
@@ -135,15 +136,19 @@ class Bound:
         state.auxiliary[RATE_VARIANCE] = density * ((1 - between) ** 2 + between**2)
         state.covariance[:] = p
         if what == "constraint":
-            model, parameter = CONSTRAINTS[0], self.plan.constraints[0]
-            seen = model.observe(state, parameter, parameter)
-            return p if seen is None else updated(p, with_rate_noise(state, seen))
+            parameter = self.plan.constraints[NON_HOLONOMIC]
+            seen = Observation(state.size)
+            if not CONSTRAINTS[NON_HOLONOMIC].observe(state, parameter, parameter, seen):
+                return p
+            with_rate_noise(state, seen)
+            return updated(p, seen)
         for source, number in enumerate(self.plan.models):
             if number == IMU or (number == MODEL["wheel_speed"]) != (what == "wheel"):
                 continue
-            seen = MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source])
-            assert seen is not None
-            p = updated(p, with_rate_noise(state, seen))
+            seen = Observation(state.size)
+            assert MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source], seen)
+            with_rate_noise(state, seen)
+            p = updated(p, seen)
         return p
 
     def row(self, number: int, source: int) -> Array:

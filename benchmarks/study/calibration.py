@@ -64,10 +64,10 @@ def calibration(runs: int, seed: int) -> Section:
     found = study(config(), runs, seed, ROUNDS)
     section = Section("Calibration and bias states")
     section.say(
-        f"{runs} runs of the nominal drive (but slip changes every 1 s, not every 0.1 s) with all of them learnt at once, "
-        f"their true values drawn from their first sigmas ({LEVER_M} m, {DELAY_MS:.0f} ms, {VELOCITY_DELAY_MS:.0f} ms, 1 %, "
-        f"1 deg), seed {seed}: RMSE / claimed sigma at some instants; the worst error of any run at the last of them, in "
-        "sigmas; the share of all errors within 2 sigma (95.4 % for an honest filter)."
+        f"{runs} runs of the nominal drive (but slip changes every 1 s, not every 0.1 s) with all states learnt at once and "
+        f"true values drawn from the initial sigmas ({LEVER_M} m, {DELAY_MS:.0f} ms, {VELOCITY_DELAY_MS:.0f} ms, 1 %, "
+        f"1 deg), seed {seed}. Each cell is RMSE / claimed sigma at an instant. Worst: the largest error of any run at the "
+        "last instant, in sigmas. Within 2 sigma: the share of all errors (95.4 % for a consistent filter)."
     )
     rows = []
     picture, axes = figure(4)

@@ -128,11 +128,11 @@ def consistency(runs: int, seed: int) -> Section:
     found = nominal_study(runs, seed)
     section = Section("Consistency: NEES and NIS")
     section.say(
-        f"{runs} runs of the nominal drive ({found.looks[-1]:.0f} s), seed {seed}, looked at once a second. Two statistics "
+        f"{runs} runs of the nominal drive ({found.looks[-1]:.0f} s), seed {seed}, sampled once a second. Two statistics "
         "of the NEES. Instants: the average over the runs at one instant, whose band is that of a chi-square variable of "
-        "runs x degrees; an honest filter is inside at 95 % of the instants, but instants near each other share their "
-        "errors. Average: over all instants and runs; the runs are independent, and how far their means scatter tells how "
-        "many degrees a run is worth (2 degrees^2 / variance of the means), which with the number of runs gives the band."
+        "runs x degrees; a consistent filter is inside at 95 % of the instants, but neighbouring instants share their "
+        "errors. Average: over all instants and runs. The runs are independent, and the scatter of their means gives the "
+        "degrees of freedom of one run (2 degrees^2 / variance of the means); with the number of runs this gives the band."
     )
     rows = []
     picture, axes = figure(len(MAIN))
@@ -153,7 +153,7 @@ def consistency(runs: int, seed: int) -> Section:
             axis.set_title(f"NEES of {name}, {runs} runs", fontsize=8)
             axis.set_xlabel("s", fontsize=7)
             axis.set_ylim(0, 2 * freedom)
-    head = ("block", "degrees", "band at an instant", "instants inside", "degrees a run is worth", "band of the average",
+    head = ("block", "degrees", "band at an instant", "instants inside", "degrees of one run", "band of the average",
             "average", "inside")  # fmt: skip
     section.table(head, rows)
     section.picture("nees", "average NEES over time against its band", picture)

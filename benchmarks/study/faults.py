@@ -36,7 +36,7 @@ ALIKE = {"gnss": {"position_correlation_s": 10.0, "velocity_correlation_s": 1.0}
 GOOD_ROUNDS = 3  # of 60 s each
 GOOD: dict[str, tuple[list[tuple[float, float, float, float]], dict[str, dict[str, Any]]]] = {
     "nominal": (nominal.TOWN, {}),
-    "GNSS errors alike over 10 s, and configured so": (nominal.TOWN, ALIKE),
+    "GNSS errors correlated over 10 s, and configured so": (nominal.TOWN, ALIKE),
     "stop and go, unsigned wheels": (STOP_AND_GO, CITY),
 }
 
@@ -116,9 +116,9 @@ def faults(runs: int, seed: int) -> Section:
     section = Section("Faults")
     section.say(
         f"{runs} runs each in the nominal drive (IMU {IMU_HZ:.0f} Hz, wheels {WHEEL_HZ:.0f} Hz, GNSS 5 Hz), seed {seed}; "
-        f"the fault lasts from {START_S:.0f} s to {STOP_S:.0f} s. Named: `Fusion.beliefs` calls the source, or one of a "
-        f"receiver's two, something else than nominal; asked every {LOOK_S * 1e3:.0f} ms. Errors are horizontal, worst of "
-        "all runs."
+        f"the fault lasts from {START_S:.0f} s to {STOP_S:.0f} s. Detected: the status of the source, or of one of a "
+        f"receiver's two sources, is no longer nominal; sampled every {LOOK_S * 1e3:.0f} ms. Errors are horizontal, worst "
+        "of all runs."
     )
     rows = []
     for name, fault in FAULTS.items():
@@ -130,11 +130,11 @@ def faults(runs: int, seed: int) -> Section:
              f"{np.median(times):.2f} s", f"{times.max():.2f} s", f"{max(f.during for f in found):.1f} m",
              f"{max(f.later for f in found):.1f} m", sum(f.others for f in found))
         )  # fmt: skip
-    head = ("fault", "named", "mostly called", "after, median", "worst", "error during",
-            f"error from {AFTER_S:.0f} s after on", "others blamed")  # fmt: skip
+    head = ("fault", "detected", "usual status", "after, median", "worst", "error during",
+            f"error from {AFTER_S:.0f} s after on", "other sources blamed")  # fmt: skip
     section.table(head, rows)
     section.say(
-        "False alarms, in drives without a fault: how often a source ceases to be called nominal, in the sum over all "
+        "False alarms, in drives without a fault: how often the status of a source stops being nominal, summed over all "
         "sources (IMU, GNSS position and velocity, four wheels)."
     )
     good = []

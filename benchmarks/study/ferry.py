@@ -58,7 +58,7 @@ def one(speed: float, seed: list[int]) -> Passage:
 
 def ferry(runs: int, seed: int) -> Section:
     section = Section("Carried with the wheels at zero")
-    section.say(f"{runs} runs each, seed {seed}: aboard for three minutes, GNSS all the time, then drive off.")
+    section.say(f"{runs} runs each, seed {seed}: carried for three minutes, with GNSS throughout, then driving off.")
     rows = []
     for name, speed in SPEEDS.items():
         found = spread(one, [(speed, [seed, run]) for run in range(runs)])

@@ -104,7 +104,7 @@ def heading(runs: int, seed: int) -> Section:
     section = Section("Start without a heading")
     section.say(
         f"{runs} seeds, start headings evenly spread over the circle, seed {seed}. Right: within 5 deg from then on. Time "
-        "is counted while GNSS is there and the vehicle drives faster than 1 m/s."
+        "is counted while GNSS is available and the vehicle drives faster than 1 m/s."
     )
     rows = []
     for name, case in CASES.items():
@@ -119,6 +119,6 @@ def heading(runs: int, seed: int) -> Section:
         )  # fmt: skip
     head = ("start", "right after, median", "worst", f"error at {IN_TIME_S:.0f} s, median", "worst", "worst in sigmas",
             f"right within {IN_TIME_S:.0f} s", f"and at {IN_TIME_S:.0f} s within 3 sigma",
-            "later instants within 3 sigma (99.7 % if honest)")  # fmt: skip
+            "later instants within 3 sigma (99.7 % if consistent)")  # fmt: skip
     section.table(head, rows)
     return section

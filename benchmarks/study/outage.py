@@ -62,7 +62,7 @@ def outage(runs: int, seed: int) -> Section:
     section = Section("GNSS outages")
     section.say(
         f"{runs} runs of each length in the nominal drive, seed {seed}, after {BEFORE_S:.0f} s with GNSS; IMU, four wheels "
-        "and the non-holonomic constraint go on. The error is horizontal, its sigma the one claimed."
+        "and the non-holonomic constraint go on. Errors and claimed sigmas are horizontal."
     )
     rows, drift = [], []
     for seconds in OUTAGES_S:

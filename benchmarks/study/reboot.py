@@ -68,7 +68,7 @@ def reboot(runs: int, seed: int) -> Section:
         back = sum(r.position < 5 and r.velocity < 1 and r.heading < 5 for r in found)
         rows.append((f"{seconds:.0f} s", f"{back} of {runs}", sum(r.resets > 0 for r in found), f"{worst[0]:.1f} s",
                      f"{worst[1]:.2f} m", f"{worst[2]:.2f} m/s", f"{worst[3]:.1f} deg"))  # fmt: skip
-    head = ("silent for", "found back (5 m, 1 m/s, 5 deg)", "aligned anew", "runs again after, worst", "position, worst",
+    head = ("silent for", "recovered (5 m, 1 m/s, 5 deg)", "aligned again", "runs again after, worst", "position, worst",
             "velocity, worst", "heading, worst")  # fmt: skip
     section.table(head, rows)
     return section

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 TITLE = "# The study\n"
 WIDTH_IN, HEIGHT_IN, DPI = 7.2, 2.6, 80
+COLUMNS = 120  # of a paragraph
 
 
 @dataclass
@@ -21,7 +23,7 @@ class Section:
     pictures: dict[str, Any] = field(default_factory=dict)  # name: matplotlib Figure
 
     def say(self, text: str) -> None:
-        self.lines += [text, ""]
+        self.lines += [textwrap.fill(text, COLUMNS, break_long_words=False, break_on_hyphens=False), ""]
 
     def table(self, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         self.lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]

@@ -23,16 +23,9 @@ import zenoh.ext
 
 from fusiond.config.schema import Encoding
 from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.messages.codec import decode
 from fusiond.messages.keys import key
-from fusiond.messages.types import (
-    ConfigMessage,
-    HealthMessage,
-    InfoMessage,
-    InnovationMessage,
-    Message,
-    StateMessage,
-    decode,
-)
+from fusiond.messages.types import ConfigMessage, HealthMessage, InfoMessage, InnovationMessage, Message, StateMessage
 from fusiond.ports.outputs import Outbox
 from fusiond_adapters.zenoh.session import CONTENT_TYPES, KIND, STREAMS, PublishError, alive_key, open_session
 

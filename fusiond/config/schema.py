@@ -55,7 +55,7 @@ class Filter(Section, frozen=True, kw_only=True):
     snapshot_interval_s: Span = 0.05  # spacing of the filter snapshots that a rewind starts from; 0: every IMU sample
     imu_gap_s: Seconds = 0.2  # an IMU that is silent for longer is bridged by coasting
     restart_gap_s: Seconds = 30.0  # after a gap of this length in the data the filter aligns again
-    gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good innovations that pass the gate
+    gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good measurements that pass the innovation gate
     gnss_reset_s: Seconds = 30.0  # GNSS rejected for this long with a consistent offset is trusted again
     gnss_return_s: Seconds = 3.0  # likewise, where no fix was fused in the 10 s before
     v_max_mps: Positive = 60.0  # top speed of the vehicle: the initial velocity sigma is a third of it
@@ -92,7 +92,7 @@ class Motion(Section, frozen=True, kw_only=True):
 
 
 class Mavlink(Section, frozen=True, kw_only=True):
-    """[mavlink.NAME]: one MAVLink link; a .tlog given to replay stands for the first of them."""
+    """[mavlink.NAME]: one MAVLink link. In a replay an unnamed .tlog is the first of them."""
 
     connection: str = "udpin:127.0.0.1:14550"  # pymavlink connection string
     baud: Annotated[int, Meta(gt=0)] = 115200  # for serial devices
@@ -104,7 +104,7 @@ class Mavlink(Section, frozen=True, kw_only=True):
     request: bool = True  # live: ask the autopilot for the messages needed, at the sensors' rates
     timesync: bool = True  # live: measure the autopilot's clock by TIMESYNC round trips
     signing_key_file: str | None = None  # 32 bytes or 64 hex digits: sign what is sent, accept only what is signed with it
-    signing_timestamp_file: str | None = None  # where the last signing timestamp is kept over restarts
+    signing_timestamp_file: str | None = None  # file that keeps the last signing timestamp over restarts
     accept_unsigned: bool = False  # with a key: accept unsigned frames too; wrongly signed ones are never accepted
 
 
@@ -117,22 +117,22 @@ class Can(Section, frozen=True, kw_only=True):
     channel: str | None = None  # python-can channel; default: python-can's own configuration
     config_context: str | None = None  # section of python-can's own configuration file
     fd: bool = False  # CAN FD
-    bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], where the interface does not set it
+    bitrate: Annotated[int, Meta(ge=1000, le=8_000_000)] | None = None  # [bit/s], if the interface does not set it
     delay_ms: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0  # age of a frame when it is received
-    j1939: bool = False  # match 29-bit ids by PGN, of any priority and sender; always so where the DBC says J1939
+    j1939: bool = False  # match 29-bit ids by PGN, of any priority and sender; implied if the DBC says J1939
 
 
 class Imu(Sensor, frozen=True, kw_only=True):
-    """[imu.NAME]: the inertial sensor that carries the state forward. Exactly one."""
+    """[imu.NAME]: the IMU that propagates the state. Exactly one."""
 
     label: ClassVar[str] = "IMU"
     required: ClassVar[bool] = True
 
-    link: Name  # the [mavlink.LINK] it comes by
+    link: Name  # the [mavlink.LINK] that carries it
     message: ImuMessage = "HIGHRES_IMU"  # the message that carries it
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
-    rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to ask the autopilot for, live
-    rotation_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of the sensor's axes against forward-right-down
+    rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to request from the autopilot, live
+    rotation_deg: Vector = (0.0, 0.0, 0.0)  # mounting roll, pitch, yaw of the sensor's axes against forward-right-down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was measured
     accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
     gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
@@ -161,7 +161,7 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     label: ClassVar[str] = "GNSS"
     point: ClassVar[str] = "lever_arm_m"
 
-    link: Name  # the [mavlink.LINK] it comes by
+    link: Name  # the [mavlink.LINK] that carries it
     message: GnssMessage = "GPS_RAW_INT"  # the message that carries it
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the position was measured
@@ -171,14 +171,14 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     velocity_delay_sigma_ms: NotNegative = 0.0  # likewise, of the velocity delay
     stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's stamp, use the receipt less delay_ms
     position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and a lower bound to what it gives
-    height_sigma_m: Positive = 3.0  # likewise, vertical
-    velocity_sigma_mps: Positive = 0.2  # likewise, per axis
+    height_sigma_m: Positive = 3.0  # the same, vertical
+    velocity_sigma_mps: Positive = 0.2  # the same for the velocity, per axis
     position_correlation_s: NotNegative = 0.0  # correlation time of position errors: dense fixes weigh less
-    velocity_correlation_s: NotNegative = 0.0  # likewise, velocity
+    velocity_correlation_s: NotNegative = 0.0  # correlation time of velocity errors
     use_velocity: bool = True  # fuse speed and course as well
     outliers: Literal["gate", "mixture"] = "gate"  # reject them, or weight each fix by its likelihood of being one
-    outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, where outliers = "mixture"
-    noise_least: Positive = 1.0  # the sigmas are learnt from the innovations, down to this multiple of the given ones
+    outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, with outliers = "mixture"
+    noise_least: Positive = 1.0  # the sigmas are learnt from the innovations, down to this multiple of the configured ones
     noise_most: Positive = 3.0  # and up to this
     group: Name | None = None  # receivers of one group share part of their error: atmosphere, multipath
     shared_sigma_m: NotNegative = 0.0  # that part of the position's error
@@ -232,7 +232,7 @@ class DualAntenna(Sensor, frozen=True, kw_only=True):
 
     label: ClassVar[str] = "GNSS yaw"
 
-    link: Name  # the [mavlink.LINK] it comes by
+    link: Name  # the [mavlink.LINK] that carries it
     message: GnssMessage = "GPS_RAW_INT"  # the message whose field `yaw` carries it; a [gnss.NAME] may read it as well
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0  # baseline from forward, clockwise; 0: autopilot corrects it
     delay_ms: Milliseconds = 0.0  # how long before its stamp the yaw was measured; it may differ from the position's
@@ -266,14 +266,14 @@ class DualAntenna(Sensor, frozen=True, kw_only=True):
 
 
 class Barometer(Sensor, frozen=True, kw_only=True):
-    """[barometer.NAME]: a static pressure sensor, taken as a height with an unknown offset. At most one."""
+    """[barometer.NAME]: a static pressure sensor, used as a height with an unknown offset. At most one."""
 
     label: ClassVar[str] = "barometer"
     only_one: ClassVar[str] = "there is one height offset to learn"
 
-    link: Name  # the [mavlink.LINK] it comes by
+    link: Name  # the [mavlink.LINK] that carries it
     message: PressureMessage = "SCALED_PRESSURE"  # the message that carries it
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # readings a second to ask the autopilot for, live
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # readings a second to request from the autopilot, live
     delay_ms: Milliseconds = 0.0  # how long before its stamp the reading was measured
     sigma_m: Positive = 1.0  # noise of one reading, as a height: wind, draught, effect of speed on static pressure
     correlation_s: NotNegative = 1.0  # correlation time of its errors
@@ -310,16 +310,16 @@ class Wheel(Sensor, frozen=True, kw_only=True):
     label: ClassVar[str] = "wheel"
     point: ClassVar[str] = "position_m"
 
-    bus: Name | None = None  # the [can.BUS] it comes by
+    bus: Name | None = None  # the [can.BUS] that carries it
     message: str | None = None  # message name in the DBC
     signal: str | None = None  # signal name in the DBC
-    link: Name | None = None  # the [mavlink.LINK] whose WHEEL_DISTANCE it comes by, in place of bus, message and signal
+    link: Name | None = None  # the [mavlink.LINK] that carries its WHEEL_DISTANCE, in place of bus, message and signal
     index: Annotated[int, Meta(ge=0, le=15)] | None = None  # its place in WHEEL_DISTANCE, from 0
     quantum_m: NotNegative = 0.0  # step of WHEEL_DISTANCE: adds quantum^2/6 over the interval's square to the variance
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # WHEEL_DISTANCE messages a second to ask for, live
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0  # WHEEL_DISTANCE messages a second to request, live
     unit: Unit = "km/h"  # of the decoded signal; rad/s and rpm need radius_m
     radius_m: Positive | None = None  # rolling radius
-    scale: float = 1.0  # known factor on the signal; negative where it counts backwards
+    scale: float = 1.0  # known factor on the signal; negative if its sign is reversed
     unsigned: bool = True  # the signal has no sign: it does not give the direction
     direction_signal: str | None = None  # a signal whose value reverse_value means driving backwards
     reverse_value: int = 1  # what direction_signal reads when driving backwards
@@ -404,18 +404,18 @@ class Publish(Section, frozen=True, kw_only=True):
 
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
     on_imu: bool = False  # each publication waits up to half a period for the next IMU sample
-    settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # of the state at the horizon, at most; 0: none
+    settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # `settled` states a second, at most; 0: none
     innovations: bool = True  # publish the innovation and outcome of every measurement
     encoding: Encoding = "json"  # "json" or "msgpack"
 
 
 class Zenoh(Section, frozen=True, kw_only=True):
-    """[zenoh]: where the state is published. Loopback and no scouting unless said otherwise."""
+    """[zenoh]: where the state is published. Loopback and no scouting by default."""
 
     mode: Literal["peer", "client", "router"] = "peer"  # a client needs a router, a peer does not
     listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # endpoints to listen on
     connect: list[str] = field(default_factory=list)  # endpoints to connect to
-    multicast_scouting: bool = False  # find and be found by others on the local network
+    multicast_scouting: bool = False  # discovery on the local network
     config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
 
 
@@ -427,7 +427,7 @@ class Live(Section, frozen=True, kw_only=True):
 
 
 class Record(Section, frozen=True, kw_only=True):
-    """[record]: the black box of `fusiond run`: what was received, as .tlog and candump .log."""
+    """[record]: the black box of `fusiond run`: all received frames, as .tlog and candump .log."""
 
     folder: str | None = None  # such as "/var/lib/fusiond/box"; none: nothing is recorded
     file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # size at which a new file is begun
@@ -439,7 +439,7 @@ class State(Section, frozen=True, kw_only=True):
 
     file: str | None = None  # such as "/var/lib/fusiond/state.json"; none: every start is a cold one
     every_s: Annotated[float, Meta(ge=1, le=86400)] = 10.0  # interval between writes; it is also written at the end
-    max_age_s: Annotated[float, Meta(gt=0, le=1e9)] = 604800.0  # one older than this is ignored; default: a week
+    max_age_s: Annotated[float, Meta(gt=0, le=1e9)] = 604800.0  # an older state is ignored; default: a week
 
 
 class Mcap(Section, frozen=True, kw_only=True):
@@ -489,11 +489,11 @@ class Prometheus(Section, frozen=True, kw_only=True):
 
 
 class Autopilot(Section, frozen=True, kw_only=True):
-    """[autopilot]: the state sent back to the autopilot as a source of its own estimator, live; off without a link."""
+    """[autopilot]: the state sent back to the autopilot as an input of its estimator, live; off without a link."""
 
     link: Name | None = None  # the [mavlink.LINK] of the autopilot; none: nothing is sent
     kind: Literal["ardupilot", "px4"] = "ardupilot"  # the autopilot whose rules the messages follow
-    message: Literal["odometry", "gps_input", "vision_position"] = "odometry"  # PX4 takes no gps_input
+    message: Literal["odometry", "gps_input", "vision_position"] = "odometry"  # PX4 does not accept gps_input
     rate_hz: Annotated[float, Meta(ge=4, le=200)] = 30.0  # messages a second; at most publish.rate_hz
     dead_reckoning: bool = True  # send while dead reckoning too, within the limits below
     position_sigma_m: Positive = 5.0  # nothing is sent beyond this horizontal position sigma, north or east

@@ -1,5 +1,89 @@
-"""The published messages: their types and encodings are here for every reader; how they are made is in the modules."""
+"""The published messages, for every reader: their types, encodings and CSV rows. The modules say how they are made."""
 
 from __future__ import annotations
 
-from fusiond.messages.types import *  # noqa: F403
+from fusiond.estimator.solution import Mode
+from fusiond.messages.codec import (
+    decode,
+    encode,
+    schemas,
+)
+from fusiond.messages.csv import (
+    CSV_COLUMNS,
+    csv_header,
+    csv_row,
+)
+from fusiond.messages.from_solution import (
+    settled_message,
+    state_message,
+)
+from fusiond.messages.types import (
+    MESSAGES,
+    SCHEMA_VERSION,
+    Block,
+    Calibration,
+    ClockHealth,
+    ConfigMessage,
+    EventKind,
+    EventMessage,
+    HealthMessage,
+    InfoMessage,
+    InnovationMessage,
+    InputHealth,
+    LatencyHealth,
+    Message,
+    OutcomeCounts,
+    OutcomeName,
+    OutputHealth,
+    Probabilities,
+    Quantiles,
+    Quaternion,
+    SettledMessage,
+    Severity,
+    SourceHealth,
+    SourceStatus,
+    State,
+    StateAtInstant,
+    StateMessage,
+    Triple,
+)
+
+__all__ = [
+    "CSV_COLUMNS",
+    "MESSAGES",
+    "SCHEMA_VERSION",
+    "Block",
+    "Calibration",
+    "ClockHealth",
+    "ConfigMessage",
+    "EventKind",
+    "EventMessage",
+    "HealthMessage",
+    "InfoMessage",
+    "InnovationMessage",
+    "InputHealth",
+    "LatencyHealth",
+    "Message",
+    "Mode",
+    "OutcomeCounts",
+    "OutcomeName",
+    "OutputHealth",
+    "Probabilities",
+    "Quantiles",
+    "Quaternion",
+    "SettledMessage",
+    "Severity",
+    "SourceHealth",
+    "SourceStatus",
+    "State",
+    "StateAtInstant",
+    "StateMessage",
+    "Triple",
+    "csv_header",
+    "csv_row",
+    "decode",
+    "encode",
+    "schemas",
+    "settled_message",
+    "state_message",
+]

@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.messages.types import Quantiles
+from fusiond.units import MILLISECOND
 
-KEPT = 4096  # the latest so many: 10 s of 400 a second
-MILLISECOND = 1e6  # ns
+KEPT = 4096  # latencies kept: 10 s at 400 Hz
 
 
 class RecentLatencies:
     """The latest few thousand latencies; written by one thread, read by any."""
 
     def __init__(self, kept: int = KEPT) -> None:
-        self.count = 0  # of all there ever were
+        self.count = 0  # number of all latencies so far
         self._ring: NDArray[np.int64] = np.zeros(kept, dtype=np.int64)
 
     def add(self, latency_ns: int) -> None:

@@ -1,7 +1,7 @@
 """The published state in the frames that others use: a plane tangent to the Earth at an origin, axes by other conventions.
 
 Frames besides those of the glossary:
-    l   local: the tangent plane at an origin that stays where it is, its third axis vertical there
+    l   local: the tangent plane at a fixed origin, its third axis vertical there
     o   odometry: the local frame less the filter's corrections, so that the pose in it never jumps, but drifts
 In the convention ENU_FLU, l is east-north-up and b is forward-left-up; in NED_FRD they are as in the glossary.
 
@@ -17,8 +17,9 @@ from typing import NamedTuple
 from fusiond.maths.portable import sin_cos
 from fusiond.maths.wgs84 import EARTH_RATE, ecef
 from fusiond.messages.types import Block, Quaternion, State, Triple
+from fusiond.units import SECOND
 
-GAP_NS = 1_000_000_000  # over a longer pause nothing is known of the way between
+GAP_NS = SECOND  # a longer pause is not bridged
 
 
 class Convention(NamedTuple):
@@ -117,7 +118,7 @@ class OdometryFrame:
         """Where the odometry frame is in the local one, and the body in the odometry frame. Stamps ascend."""
         last, self._last = self._last, (t_ns, state)
         if last is not None and 0 < t_ns - last[0] <= GAP_NS:
-            dt = (t_ns - last[0]) / 1e9
+            dt = (t_ns - last[0]) / SECOND
             step = _about_vertical(self._turn, _scaled(_sum(last[1].velocity_l, state.velocity_l), dt / 2))
             self._position_o = _sum(self._position_o, step)
             self._turn -= _correction(last[1], state, dt)
@@ -130,7 +131,7 @@ class OdometryFrame:
 
 
 def _correction(before: LocalState, after: LocalState, dt: float) -> float:
-    """By how much [rad] the heading changed more than the angular rate accounts for."""
+    """Change of heading [rad] that the angular rate does not account for."""
     w, _, _, z = _product(after.quaternion_lb, _conjugate(before.quaternion_lb))
     rate = (before.angular_rate_l[2] + after.angular_rate_l[2]) / 2
     return math.remainder(2 * math.atan2(z, w) - rate * dt, math.tau)

@@ -1,8 +1,7 @@
 """What goes out at a tick: the state, and when they are due the settled state, innovations, events and the health.
 
 All but the latencies and what is said of inputs and outputs depends on the events and their receive stamps alone, so a
-replay makes the same messages as the live run did. A reset's reason is read off the filter's state: it is not finite, it
-aligned anew, or else a source that was rejected for long is believed again (the one fused beyond its gate).
+replay makes the same messages as the live run did. The reason of a reset is in the filter's state.
 """
 
 from __future__ import annotations
@@ -16,14 +15,15 @@ import numpy as np
 
 from fusiond import __version__
 from fusiond.config.schema import Config
-from fusiond.engine import FIELDS, RATE_DENOMINATOR, Engine, totals
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.estimator.solution import Mode
 from fusiond.events import Received
 from fusiond.filter.calibration import calibrations
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import LAST_RATIO, NEVER, RESET_REASON, RESET_SOURCE, T_FUSED, T_REJECTED, ResetReason
+from fusiond.messages.from_solution import settled_message
 from fusiond.messages.innovations import Innovations
+from fusiond.messages.outcomes import outcome_counts, totals
 from fusiond.messages.types import (
     Calibration,
     ClockHealth,
@@ -32,18 +32,17 @@ from fusiond.messages.types import (
     InputHealth,
     LatencyHealth,
     Message,
-    OutcomeCounts,
     OutputHealth,
     Probabilities,
     Severity,
     SourceHealth,
     SourceStatus,
     StateMessage,
-    settled_message,
 )
 from fusiond.timeline.clock import ClockReport
 
 SECOND = 1_000_000_000  # ns
+RATE_DENOMINATOR = 1_000_000  # a rate is taken as a fraction with at most this, so that ticks never drift
 HEALTH_NS = SECOND  # between two of them, when nothing changes
 LOOK_NS = SECOND // 10  # between two looks at what the sources are held to be
 ABSENT_NS = 2 * SECOND  # a source that has brought nothing for so long is not present
@@ -64,17 +63,17 @@ class Surroundings(NamedTuple):
 
 
 class Publication:
-    """The messages of one engine. `surroundings` is asked whenever a health is made."""
+    """What is published besides the states. `surroundings` is asked whenever a health is made."""
 
-    def __init__(self, config: Config, engine: Engine, surroundings: Callable[[], Surroundings] = Surroundings) -> None:
-        self._vehicle, self._engine, self._surroundings = config.vehicle.name, engine, surroundings
+    def __init__(self, config: Config, fusion: Fusion, surroundings: Callable[[], Surroundings] = Surroundings) -> None:
+        self._vehicle, self._fusion, self._surroundings = config.vehicle.name, fusion, surroundings
         settled = config.publish.settled_hz
         self._settled_ns = SECOND / Fraction(settled).limit_denominator(RATE_DENOMINATOR) if settled else None
         self._next_settled_ns = self._next_health_ns = 0  # from the first event
         self._last_settled_ns: int = NEVER
-        self._innovations = Innovations(self._vehicle, engine.fusion) if config.publish.innovations else None
-        self._sources = Sources(engine.fusion)
-        self._changes = Changes(config, engine.fusion)
+        self._innovations = Innovations(self._vehicle, fusion) if config.publish.innovations else None
+        self._sources = Sources(fusion)
+        self._changes = Changes(config, fusion)
 
     def add(self, event: Received, receipt: Receipt) -> None:
         """Take note of a measurement and what became of it."""
@@ -82,9 +81,8 @@ class Publication:
         if self._innovations:
             self._innovations.add(receipt)
 
-    def at(self, since_start_ns: int, state: StateMessage) -> Iterator[Message]:
-        """Everything that goes out at a tick, the state first."""
-        yield state
+    def after_state(self, since_start_ns: int, state: StateMessage) -> Iterator[Message]:
+        """What goes out at a tick after its state, in order. To be taken whole, before anything else is done."""
         if self._settled_ns is not None and since_start_ns >= self._next_settled_ns:
             self._next_settled_ns = int((since_start_ns // self._settled_ns + 1) * self._settled_ns)
             yield from self._settled()
@@ -96,22 +94,22 @@ class Publication:
             if since_start_ns >= self._next_health_ns:
                 self._next_health_ns = (since_start_ns // HEALTH_NS + 1) * HEALTH_NS
                 self._sources.measure_rates(state.t_ns)
-            yield self.health(state)
+            yield self.health(since_start_ns, state)
 
     def _settled(self) -> Iterator[Message]:
-        estimate = self._engine.fusion.settled()
+        estimate = self._fusion.settled()
         if estimate.t_ns > self._last_settled_ns:  # not before the first, and each but once
             self._last_settled_ns = estimate.t_ns
-            yield settled_message(estimate, self._vehicle, totals(self._engine.fusion))
+            yield settled_message(estimate, self._vehicle, totals(self._fusion))
 
-    def health(self, state: StateMessage) -> HealthMessage:
+    def health(self, since_start_ns: int, state: StateMessage) -> HealthMessage:
         """How everything is at the instant of a state."""
-        around, began = self._surroundings(), self._engine.first_ns
+        around = self._surroundings()
         return HealthMessage(
             vehicle=self._vehicle,
             t_ns=state.t_ns,
             version=__version__,
-            uptime_s=0.0 if began is None else (state.t_ns - began) / SECOND,
+            uptime_s=since_start_ns / SECOND,
             mode=state.mode,
             resets=state.resets,
             reset_reason=self._changes.reset_reason,
@@ -122,7 +120,7 @@ class Publication:
             outputs=dict(around.outputs),
             calibration={
                 name: Calibration(value=value, sigma=sigma)
-                for name, (value, sigma) in calibrations(self._engine.fusion.plan, self._engine.fusion.history.head).items()
+                for name, (value, sigma) in calibrations(self._fusion.plan, self._fusion.history.head).items()
             },
         )
 
@@ -161,7 +159,7 @@ class Sources:
         for i, source in enumerate(fusion.plan.sources):
             last = self._received.get(source)
             found[source] = SourceHealth(
-                outcomes=OutcomeCounts(**{name: counts[i][outcome] for outcome, name in FIELDS.items()}),
+                outcomes=outcome_counts(counts[i]),
                 present=source in present,
                 age_ms=None if last is None else (t_ns - last) / 1e6,
                 rate_hz=self._rates[source],
@@ -221,14 +219,13 @@ class Changes:
         """Why the state was reset, in words."""
         stamps = self._fusion.history.head.stamps
         source = self._fusion.plan.sources[int(stamps[RESET_SOURCE])]
-        gap = f"more than {self._config.filter.restart_gap_s:g} s without data; aligning anew"
         return {
             ResetReason.NONE: "",
-            ResetReason.DATA_GAP: gap,
-            ResetReason.HEADING_LOST: "the heading was lost without the IMU; aligning anew",
-            ResetReason.NOT_FINITE: "a number was no longer finite; aligning anew",
-            ResetReason.SOURCE_RETURNED: f"{source} was rejected for long with the same error, and is now taken as right",
-            ResetReason.HEADING_DECIDED: "the drive has decided on the heading, which was a stored one",
+            ResetReason.DATA_GAP: f"no data for more than {self._config.filter.restart_gap_s:g} s; aligning again",
+            ResetReason.HEADING_LOST: "the heading was lost without the IMU; aligning again",
+            ResetReason.NOT_FINITE: "the state was not finite; aligning again",
+            ResetReason.SOURCE_RETURNED: f"{source} was rejected too long with a constant error; the state was set to it",
+            ResetReason.HEADING_DECIDED: "the drive contradicted or confirmed the stored heading; the heading is decided",
         }[ResetReason(int(stamps[RESET_REASON]))]
 
 

@@ -1,21 +1,17 @@
-"""The published messages: their types, their encodings, their JSON Schema, and the CSV row of a publication.
+"""The types of the published messages, with the meaning and unit of every field.
 
-A message is built once from an estimate, degrees and all; both encodings and the CSV row are made from its numbers, so
-they agree bit for bit. No message ever carries a number that is not finite. Messages are immutable, so whoever holds one
-holds state and covariance of one instant: nothing can change under a reader, in whatever thread.
+No message carries a number that is not finite. Messages are immutable: a reader in any thread sees the state and the
+covariance of one instant.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-import msgspec
 from msgspec import Meta, Struct
 
 from fusiond.config.schema import Encoding
-from fusiond.estimator.solution import ATTITUDE, POSITION, VELOCITY, Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import Mode
 
 SCHEMA_VERSION = 1  # raised when a field changes its meaning, its unit or its type, or goes; not when one is added
 
@@ -29,11 +25,11 @@ def _about(text: str) -> Meta:
 
 
 class Message(Struct, frozen=True, kw_only=True):
-    """What every published message is."""
+    """A published message."""
 
 
 class OutcomeCounts(Message, frozen=True, kw_only=True):
-    """What became of every measurement offered since the start, by its last word."""
+    """Measurements offered since the start, counted by their latest outcome."""
 
     fused: Annotated[int, _about("used")] = 0
     rejected: Annotated[int, _about("outside the innovation gate")] = 0
@@ -54,14 +50,14 @@ class State(Message, frozen=True, kw_only=True):
     roll_deg: Annotated[float, _about("roll [deg], Z-Y-X convention, (-180, 180]")]
     pitch_deg: Annotated[float, _about("pitch [deg], [-90, 90]")]
     yaw_deg: Annotated[float, _about("yaw [deg], clockwise from north, (-180, 180]")]
-    angular_rate_b_rps: Annotated[Triple, _about("angular rate [rad/s] in b, freed of bias")]
+    angular_rate_b_rps: Annotated[Triple, _about("angular rate [rad/s] in b, corrected for bias")]
     acceleration_b_mps2: Annotated[
-        Triple, _about("specific force [m/s^2] in b, freed of bias: (0, 0, -9.8) level and at rest")
+        Triple, _about("specific force [m/s^2] in b, corrected for bias: (0, 0, -9.8) level and at rest")
     ]
     gyro_bias_rps: Annotated[Triple, _about("gyro bias [rad/s] in b")]
     accel_bias_mps2: Annotated[Triple, _about("accelerometer bias [m/s^2] in b")]
-    wheel_scale: Annotated[float, _about("what all wheels read too much, as a fraction: 0.01 is 1 %")]
-    mount_deg: Annotated[tuple[float, float], _about("pitch and yaw [deg] of the IMU against the vehicle")]
+    wheel_scale: Annotated[float, _about("fraction by which all wheels read too high: 0.01 is 1 %")]
+    mount_deg: Annotated[tuple[float, float], _about("mounting pitch and yaw [deg] of the IMU in the vehicle")]
     covariance_position_m2: Annotated[Block, _about("position covariance [m^2] in n, 3 x 3 row by row")]
     covariance_velocity_m2ps2: Annotated[Block, _about("velocity covariance [m^2/s^2] in n, 3 x 3 row by row")]
     covariance_attitude_rad2: Annotated[
@@ -79,23 +75,23 @@ class State(Message, frozen=True, kw_only=True):
 
 
 class StateAtInstant(Message, frozen=True, kw_only=True):
-    """What StateMessage and SettledMessage have in common: their layout."""
+    """The common layout of StateMessage and SettledMessage."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    t_ns: Annotated[int, _about("instant the state is valid for [ns]: Unix time of the receiving host")]
-    mode: Annotated[Mode, _about("how far to trust it: aligning (no state yet), nominal, dead_reckoning, lost")]
+    t_ns: Annotated[int, _about("instant the state is valid for [ns], Unix time of the receiving host")]
+    mode: Annotated[Mode, _about("aligning (no state yet), nominal, dead_reckoning or lost")]
     age_ms: Annotated[
-        float | None, _about("t_ns less the stamp of the last IMU sample behind it [ms]; null before the first")
+        float | None, _about("t_ns less the stamp of the newest IMU sample used [ms]; null before the first")
     ]
-    resets: Annotated[int, _about("how often the state was reset, that is: jumped")]
-    fault: Annotated[str | None, _about("why the filter's state was withheld; null when all is well")] = None
-    state: Annotated[State | None, _about("the state; null while there is none to tell")]
-    outcomes: Annotated[OutcomeCounts, _about("what became of the measurements so far")]
+    resets: Annotated[int, _about("number of resets, that is jumps of the state")]
+    fault: Annotated[str | None, _about("why the state was withheld; null otherwise")] = None
+    state: Annotated[State | None, _about("the state; null while there is none")]
+    outcomes: Annotated[OutcomeCounts, _about("outcomes of the measurements so far")]
 
 
 class StateMessage(StateAtInstant, frozen=True, kw_only=True):
-    """The filter's answer at one instant, published on fusiond/<vehicle>/state."""
+    """The state at one instant, on fusiond/<vehicle>/state."""
 
 
 class SettledMessage(StateAtInstant, frozen=True, kw_only=True):
@@ -109,36 +105,36 @@ Severity = Literal["info", "notice", "warning", "critical"]
 
 
 class InnovationMessage(Message, frozen=True, kw_only=True):
-    """How one measurement was judged, as soon as it was, on fusiond/<vehicle>/innovations/<source>."""
+    """How one measurement was judged, as soon as that is known, on fusiond/<vehicle>/innovations/<source>."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    source: Annotated[str, _about("whose measurement")]
-    t_ns: Annotated[int, _about("instant it was true at [ns]")]
+    source: Annotated[str, _about("source of the measurement")]
+    t_ns: Annotated[int, _about("instant of the measurement, aligned [ns]")]
     t_receive_ns: Annotated[int, _about("when it was received [ns]")]
-    outcome: Annotated[OutcomeName, _about("what became of it; a late measurement of another source can change that yet")]
-    test_ratio: Annotated[float | None, _about("squared innovation over its limit, 1 at the gate; null if not judged")]
+    outcome: Annotated[OutcomeName, _about("its outcome, which a late measurement of another source can still change")]
+    test_ratio: Annotated[float | None, _about("squared innovation over its limit, 1 at the gate; null if not tested")]
     innovation: Annotated[
-        tuple[float, ...], _about("measurement less prediction, in the measurement's unit; empty if not judged")
+        tuple[float, ...], _about("measurement less prediction, in the measurement's unit; empty if not tested")
     ]
-    variance: Annotated[tuple[float, ...], _about("variances that the filter expected of the innovation, per axis")]
+    variance: Annotated[tuple[float, ...], _about("variances that the filter expects of the innovation, per axis")]
     reason: Annotated[str | None, _about("why it is invalid; null otherwise")] = None
 
 
 class EventMessage(Message, frozen=True, kw_only=True):
-    """Something happened that a person may want to know at once, on fusiond/<vehicle>/events."""
+    """An event that an operator may want to know of at once, on fusiond/<vehicle>/events."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    t_ns: Annotated[int, _about("when it was seen [ns]")]
+    t_ns: Annotated[int, _about("when it was detected [ns]")]
     kind: Annotated[EventKind, _about("mode, reset, source_lost, source_found or source_status")]
     severity: Annotated[Severity, _about("info, notice, warning or critical")]
     subject: Annotated[str, _about("the mode entered, or the source; empty for a reset")]
-    text: Annotated[str, _about("what to tell people, in a line")]
+    text: Annotated[str, _about("one line for people")]
 
 
 class Quantiles(Message, frozen=True, kw_only=True):
-    """Of the latest few thousand latencies."""
+    """Quantiles of the latest few thousand latencies."""
 
     p50: Annotated[float, _about("median [ms]")]
     p90: Annotated[float, _about("90 % are below [ms]")]
@@ -147,99 +143,99 @@ class Quantiles(Message, frozen=True, kw_only=True):
 
 
 class LatencyHealth(Message, frozen=True, kw_only=True):
-    """How long things take inside; null before the first."""
+    """Latencies inside the daemon; null before the first."""
 
-    fused: Annotated[Quantiles | None, _about("from the receipt of a measurement to its having been fused [ms]")] = None
+    fused: Annotated[Quantiles | None, _about("from the receipt of a measurement to the end of its fusion [ms]")] = None
     published: Annotated[
-        Quantiles | None, _about("from the instant of a publication to its being handed to the outputs [ms]")
+        Quantiles | None, _about("from the instant of a publication to its handover to the outputs [ms]")
     ] = None
 
 
 class ClockHealth(Message, frozen=True, kw_only=True):
-    """How the clock that a source stamps with is placed on the time line."""
+    """Alignment of the clock that a source stamps with."""
 
-    name: Annotated[str, _about("the clock: unix, <link>/<system>/boot, or arrival where there is no stamp")]
+    name: Annotated[str, _about("the clock: unix, <link>/<system>/boot, or arrival if there is no stamp")]
     method: Annotated[str, _about("unix, timesync, system_time, least_offset or arrival")]
-    offset_ms: Annotated[float, _about("time line less the clock's stamp [ms]")]
+    offset_ms: Annotated[float, _about("common time line less the clock's stamp [ms]")]
     drift_ppm: Annotated[float, _about("how much faster the host's clock runs")]
     jitter_ms: Annotated[float, _about("mean of receipt less aligned stamp since the last re-alignment [ms]")]
     resets: Annotated[int, _about("re-alignments after a jump or a reboot")]
-    strays: Annotated[int, _about("stamps that made no sense")]
+    strays: Annotated[int, _about("implausible stamps")]
     note: Annotated[str, _about("why no better method is in use")] = ""
 
 
 class Probabilities(Message, frozen=True, kw_only=True):
-    """What a source is up to; they sum to 1."""
+    """Probabilities of the conditions that a source can be in; they sum to 1."""
 
-    nominal: Annotated[float, _about("as its configuration says")]
-    noisy: Annotated[float, _about("scatters more than that")]
-    biased: Annotated[float, _about("off to one side")]
-    frozen: Annotated[float, _about("repeats itself")]
-    absent: Annotated[float, _about("not there")]
+    nominal: Annotated[float, _about("as configured")]
+    noisy: Annotated[float, _about("noisier than configured")]
+    biased: Annotated[float, _about("offset to one side")]
+    frozen: Annotated[float, _about("repeats one value")]
+    absent: Annotated[float, _about("sends nothing")]
 
 
 class SourceHealth(Message, frozen=True, kw_only=True):
     """One source of measurements."""
 
-    outcomes: Annotated[OutcomeCounts, _about("what became of its measurements so far")]
-    present: Annotated[bool, _about("whether anything of it was received in the last 2 s")]
+    outcomes: Annotated[OutcomeCounts, _about("outcomes of its measurements so far")]
+    present: Annotated[bool, _about("whether anything was received from it in the last 2 s")]
     age_ms: Annotated[float | None, _about("since its last receipt [ms]; null before the first")] = None
-    rate_hz: Annotated[float, _about("receipts a second, lately")] = 0.0
-    test_ratio: Annotated[float | None, _about("of its last measurement, 1 at the gate; null if none was judged")] = None
+    rate_hz: Annotated[float, _about("receipts per second, recently")] = 0.0
+    test_ratio: Annotated[float | None, _about("of its last measurement, 1 at the gate; null if none was tested")] = None
     nis_mean: Annotated[
         float | None, _about("mean over the horizon of the squared innovations per axis, in sigmas: 1 is as expected")
     ] = None
     clock: Annotated[ClockHealth | None, _about("the clock it stamps with; null before the first measurement")] = None
-    probabilities: Annotated[Probabilities | None, _about("what it is up to; null if that is not judged")] = None
-    status: Annotated[SourceStatus | None, _about("the likeliest of these; null if that is not judged")] = None
-    reason: Annotated[str | None, _about("what speaks for that status; null if nothing needs saying")] = None
+    probabilities: Annotated[Probabilities | None, _about("of its conditions; null if it is not judged")] = None
+    status: Annotated[SourceStatus | None, _about("its likeliest condition; null if it is not judged")] = None
+    reason: Annotated[str | None, _about("reason for that status; null if there is none")] = None
 
 
 class InputHealth(Message, frozen=True, kw_only=True):
     """One link or bus."""
 
     received: Annotated[int, _about("frames received")]
-    dropped: Annotated[int, _about("frames dropped, the oldest first, because the queue was full")]
-    counts: Annotated[dict[str, int], _about("what became of the others, by kind; and of the link")]
+    dropped: Annotated[int, _about("frames dropped because the queue was full")]
+    counts: Annotated[dict[str, int], _about("other counts of its frames and of the link, by kind")]
 
 
 class OutputHealth(Message, frozen=True, kw_only=True):
     """One output."""
 
-    offered: Annotated[int, _about("messages left for it")]
-    dropped: Annotated[int, _about("messages dropped, the oldest first, because it was slow or away")]
+    offered: Annotated[int, _about("messages put into its queue")]
+    dropped: Annotated[int, _about("messages dropped, the oldest first, because the output was slow or away")]
     latency_ms: Annotated[
-        Quantiles | None, _about("from the instant of a publication to its being sent or taken up here; null before")
+        Quantiles | None, _about("from the instant of a publication to its being sent or taken from the queue; null before")
     ] = None
-    counts: Annotated[dict[str, int], _about("what became of the others, by kind")]
-    notes: Annotated[dict[str, str], _about("what else there is to tell, such as whether the autopilot uses it")]
+    counts: Annotated[dict[str, int], _about("other counts, by kind")]
+    notes: Annotated[dict[str, str], _about("further notes, such as whether the autopilot uses the state")]
 
 
 class Calibration(Message, frozen=True, kw_only=True):
-    """Something of the installation that is learnt."""
+    """A parameter of the installation that is learnt."""
 
-    value: Annotated[float, _about("as learnt so far, in the unit that its name ends in")]
+    value: Annotated[float, _about("correction to the configured value, in the unit that its name ends in")]
     sigma: Annotated[float, _about("one standard deviation of it")]
 
 
 class HealthMessage(Message, frozen=True, kw_only=True):
-    """How everything is, each second and at every change of mode, resets or sources, on fusiond/<vehicle>/health."""
+    """Health of all parts, each second and at every change of mode, resets or sources, on fusiond/<vehicle>/health."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
-    t_ns: Annotated[int, _about("the instant it tells of [ns]")]
+    t_ns: Annotated[int, _about("the instant it describes [ns]")]
     version: Annotated[str, _about("of fusiond")]
     uptime_s: Annotated[float, _about("since the first measurement [s]")]
     mode: Annotated[Mode, _about("as in the state")]
-    resets: Annotated[int, _about("how often the state was reset, that is: jumped")]
-    reset_reason: Annotated[str | None, _about("why it was reset the last time; null before")] = None
+    resets: Annotated[int, _about("number of resets, that is jumps of the state")]
+    reset_reason: Annotated[str | None, _about("reason of the last reset; null before the first")] = None
     outcomes: Annotated[OutcomeCounts, _about("over all sources")]
-    latency_ms: Annotated[LatencyHealth, _about("how long things take inside")]
+    latency_ms: Annotated[LatencyHealth, _about("latencies inside the daemon")]
     sources: Annotated[dict[str, SourceHealth], _about("by name")]
     inputs: Annotated[dict[str, InputHealth], _about("by kind and name, such as mavlink.fc")]
     outputs: Annotated[dict[str, OutputHealth], _about("by name, such as zenoh")]
     calibration: Annotated[
-        dict[str, Calibration], _about("what is learnt of the installation: what each is more than configured, by name")
+        dict[str, Calibration], _about("learnt corrections to the configured installation, by name")
     ] = {}
 
 
@@ -249,10 +245,10 @@ class InfoMessage(Message, frozen=True, kw_only=True):
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
     version: Annotated[str, _about("of fusiond")]
-    kernel: Annotated[Literal["compiled", "numpy"], _about("compiled, or its slower twin in NumPy")]
+    kernel: Annotated[Literal["compiled", "numpy"], _about("compiled, or the slower one in NumPy")]
     encoding: Annotated[Encoding, _about("of everything published over Zenoh")]
     schemas: Annotated[dict[str, int], _about("versions of the messages' layouts, by the last part of the key")]
-    keys: Annotated[dict[str, str], _about("what is published where, by the last part of the key")]
+    keys: Annotated[dict[str, str], _about("where each message is published, by the last part of the key")]
     sources: Annotated[dict[str, str], _about("what each source measures: imu, gnss_position, ...")]
     config: Annotated[dict[str, Any], _about("the configuration, defaults filled in")]
 
@@ -274,177 +270,3 @@ MESSAGES: dict[str, type[Message]] = {  # by the last part of the key; of innova
     "info": InfoMessage,
     "config": ConfigMessage,
 }
-
-
-def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
-    """The message that tells of an estimate.
-
-    A state with a number that is not finite, or with a negative variance, is withheld: the message then has mode
-    `lost`, no state, and says in `fault` which number was to blame. So the publication goes on, and a reader sees why.
-    """
-    return _told(StateMessage, estimate, vehicle, outcomes)
-
-
-def settled_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
-    """The same of an estimate at the horizon."""
-    return _told(SettledMessage, estimate, vehicle, outcomes)
-
-
-AnyState = TypeVar("AnyState", bound=StateAtInstant)
-
-
-def _told(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
-    state, fault = _checked(estimate.state) if estimate.state is not None else (None, None)
-    return kind(
-        vehicle=vehicle,
-        t_ns=estimate.t_ns,
-        mode=Mode.LOST if fault else estimate.mode,
-        age_ms=None if estimate.age_ns is None else estimate.age_ns / 1e6,
-        resets=estimate.resets,
-        fault=fault,
-        state=state,
-        outcomes=outcomes,
-    )
-
-
-def _checked(estimate: StateEstimate) -> tuple[State | None, str | None]:
-    """The published state, or None and what is wrong with it."""
-    if not all(variance >= 0 for variance in estimate.covariance.diagonal().tolist()):
-        return None, "covariance: a variance is negative or not a number"
-    state = _published(estimate)
-    values = [value if isinstance(value, tuple) else (value,) for value in msgspec.structs.astuple(state)]
-    if math.isfinite(sum(map(sum, values))):
-        return state, None
-    for name, value in zip(state.__struct_fields__, values, strict=True):
-        if not all(map(math.isfinite, value)):
-            return None, f"{name}: not finite"
-    return state, None
-
-
-def _published(estimate: StateEstimate) -> State:
-    """The state in the units of the message. Raises ValueError on a negative variance."""
-    roll, pitch, yaw = estimate.euler()
-    return State(
-        lat_deg=math.degrees(estimate.latitude),
-        lon_deg=math.degrees(estimate.longitude),
-        height_m=float(estimate.height),
-        velocity_ned_mps=_triple(estimate.velocity_n),
-        quaternion_nb=_quaternion(estimate.quaternion_nb),
-        roll_deg=math.degrees(roll),
-        pitch_deg=math.degrees(pitch),
-        yaw_deg=math.degrees(yaw),
-        angular_rate_b_rps=_triple(estimate.angular_rate_b),
-        acceleration_b_mps2=_triple(estimate.acceleration_b),
-        gyro_bias_rps=_triple(estimate.gyro_bias),
-        accel_bias_mps2=_triple(estimate.accel_bias),
-        wheel_scale=float(estimate.wheel_scale),
-        mount_deg=_degrees(estimate.mount),
-        covariance_position_m2=_block(estimate, POSITION),
-        covariance_velocity_m2ps2=_block(estimate, VELOCITY),
-        covariance_attitude_rad2=_block(estimate, ATTITUDE),
-        sigma_position_ned_m=estimate.sigma_position_n(),
-        sigma_velocity_mps=estimate.sigma_velocity(),
-        sigma_yaw_deg=math.degrees(estimate.sigma_yaw()),
-        sigma_gyro_bias_rps=_triple(estimate.sigma_gyro_bias),
-        sigma_accel_bias_mps2=_triple(estimate.sigma_accel_bias),
-        sigma_wheel_scale=float(estimate.sigma_wheel_scale),
-        sigma_mount_deg=_degrees(estimate.sigma_mount),
-    )
-
-
-# NumPy's scalars pass for floats, but msgspec refuses them and their repr is not a number's: hence float() below.
-
-
-def _triple(vector: Triple) -> Triple:
-    x, y, z = vector
-    return float(x), float(y), float(z)
-
-
-def _quaternion(quaternion: Quaternion) -> Quaternion:
-    w, x, y, z = quaternion
-    return float(w), float(x), float(y), float(z)
-
-
-def _degrees(angles: tuple[float, float]) -> tuple[float, float]:
-    return math.degrees(angles[0]), math.degrees(angles[1])
-
-
-def _block(estimate: StateEstimate, block: slice) -> Block:
-    """Symmetric to the last bit, which the turn into n leaves open."""
-    a, b, c, d, e, f, g, h, i = estimate.covariance[block, block].ravel().tolist()
-    b, c, f = (b + d) / 2, (c + g) / 2, (f + h) / 2
-    return a, b, c, b, e, f, c, f, i
-
-
-# --- Encodings
-
-AnyMessage = TypeVar("AnyMessage", bound=Message)
-
-_json = msgspec.json.Encoder()
-_msgpack = msgspec.msgpack.Encoder()
-
-
-def encode(message: Message, encoding: Encoding) -> bytes:
-    """The bytes of a message. JSON numbers are the shortest that read back as the same float."""
-    return _json.encode(message) if encoding == "json" else _msgpack.encode(message)
-
-
-def decode(data: bytes, kind: type[AnyMessage], encoding: Encoding) -> AnyMessage:
-    """The message in the bytes; fields it does not know are passed over. Raises msgspec.DecodeError."""
-    return msgspec.json.decode(data, type=kind) if encoding == "json" else msgspec.msgpack.decode(data, type=kind)
-
-
-def schemas() -> Iterator[tuple[str, bytes]]:
-    """File name and text of each message's JSON Schema, as kept in docs/schema/."""
-    for name, kind in MESSAGES.items():
-        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(kind)}
-        yield f"{name}.schema.json", msgspec.json.format(msgspec.json.encode(schema), indent=2) + b"\n"
-
-
-# --- CSV
-
-CSV_COLUMNS = (
-    "unix_us",
-    "lat_deg",
-    "lon_deg",
-    "height_m",
-    "vn_mps",
-    "ve_mps",
-    "vd_mps",
-    "roll_deg",
-    "pitch_deg",
-    "yaw_deg",
-    "sigma_n_m",
-    "sigma_e_m",
-    "sigma_d_m",
-    "sigma_v_mps",
-    "sigma_yaw_deg",
-    "mode",
-)
-
-
-def csv_header() -> str:
-    """The line that names the columns, without its end."""
-    return ",".join(CSV_COLUMNS)
-
-
-def csv_row(message: StateMessage) -> str:
-    """One line, without its end. Numbers are the shortest that read back as the same float; no state, empty cells."""
-    numbers = _csv_numbers(message.state) if message.state else [""] * (len(CSV_COLUMNS) - 2)
-    return ",".join([str(message.t_ns // 1000), *numbers, message.mode.value])
-
-
-def _csv_numbers(state: State) -> Iterable[str]:
-    numbers = (
-        state.lat_deg,
-        state.lon_deg,
-        state.height_m,
-        *state.velocity_ned_mps,
-        state.roll_deg,
-        state.pitch_deg,
-        state.yaw_deg,
-        *state.sigma_position_ned_m,
-        state.sigma_velocity_mps,
-        state.sigma_yaw_deg,
-    )
-    return map(repr, numbers)

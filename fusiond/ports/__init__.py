@@ -1,1 +1,1 @@
-"""What an adapter implements: inputs, outputs, and the bounded boxes between their threads and the engine."""
+"""The interfaces that adapters implement: inputs, outputs, and the bounded queues between their threads and the engine."""

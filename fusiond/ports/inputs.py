@@ -1,23 +1,25 @@
-"""What the live inputs have in common: a bounded inbox between their threads and the engine, and their health.
+"""The interface of live inputs, and the bounded inbox between an input's thread and the engine.
 
-Each input is read in a thread of its own, so that a receipt is stamped when it happens and no input can hold up
-another. When the inbox of an input is full it is thinned: every third frame of the kinds that come most often is
-dropped, and counted. So an estimator that cannot keep up still has every instant of them all, and whatever comes seldom.
+Each input is read in a thread of its own: receipts are stamped when they happen, and no input can delay another. A full
+inbox is thinned: every third frame of the most frequent kinds is dropped and counted. An estimator that cannot keep up
+still gets frames of every kind, evenly spread, and all of the rare kinds.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from threading import Event, Lock
 from typing import Generic, Protocol, TypeVar
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
+from fusiond.ports.clock import Clock
 
 Item = TypeVar("Item")
-THIN = 3  # a full inbox loses one in so many: gaps of two, four, eight would make a rolling counter stand still
-POLL_S = 0.2  # how long a thread waits for input before it looks whether it is to stop
+THIN = 3  # a full inbox drops every third frame; with every second, a rolling counter would seem to stand still
+POLL_S = 0.2  # a thread looks at least this often whether it should stop
 
 
 class InputLost(Exception):
@@ -26,17 +28,17 @@ class InputLost(Exception):
 
 class Inbox(Generic[Item]):
     """Stamped frames on their way from an input's thread to the engine, at most `size`. `wake` is called when an empty
-    one fills; `kind` tells frames apart that tell different things."""
+    one fills; `kind` gives the kind of a frame, such as its message id."""
 
     def __init__(self, size: int, wake: Callable[[], None], kind: Callable[[Item], Hashable]) -> None:
         self.received = self.dropped = 0
-        self.missed = 0  # frames that were lost before they came here, as far as the input can tell
+        self.missed = 0  # frames lost before they reached the inbox, as far as the input knows
         self._items: list[tuple[int, Item]] = []
         self._size, self._wake, self._kind = size, wake, kind
         self._lock = Lock()
 
     def put(self, t_ns: int, item: Item) -> None:
-        """Leave a frame, received at `t_ns`."""
+        """Add a frame received at `t_ns`."""
         with self._lock:
             was_empty = not self._items
             self.received += 1
@@ -47,14 +49,14 @@ class Inbox(Generic[Item]):
             self._wake()
 
     def take(self) -> list[tuple[int, Item]]:
-        """All that was left since the last time, oldest first."""
+        """The frames put since the last time, oldest first."""
         with self._lock:
             items, self._items = self._items, []
         return items
 
     def _thin(self) -> None:
-        """Of each kind that is there more often than the mean drop every third frame, but none that came later after the
-        one before than they do on average: what is left lies evenly. Of kinds without number drop the oldest."""
+        """Drop every third frame of each kind that is more frequent than the mean. A frame after a longer gap than usual is
+        kept, so the rest is evenly spread. With too many different kinds, drop the oldest third."""
         kinds = [self._kind(item) for _, item in self._items]
         stamps: dict[Hashable, list[int]] = {}
         for (t_ns, _), kind in zip(self._items, kinds, strict=True):
@@ -86,23 +88,34 @@ class LiveInput(Protocol[Item]):
 
     name: str
     about: str  # for people
-    file: str  # the log that a frame belongs to: the name of a file without its date
+    file: str  # name of the log for its frames, without the date
     inbox: Inbox[Item]
 
     def configure(self, config: Config) -> None:
-        """Take what may change while running, for the sessions to come. Raises ConfigError."""
+        """Use a new configuration from the next session on. Raises ConfigError."""
 
     def prepare(self) -> None:
-        """Load what takes long to load. Once, before the first session. Raises ConfigError."""
+        """Do slow loading once, before the first session. Raises ConfigError."""
 
     def session(self, stop: Event) -> None:
-        """Open, read into the inbox until told to stop, close. Raises InputLost."""
+        """Open, read into the inbox until `stop` is set, close. Raises InputLost."""
 
     def decode(self, item: Item, t_ns: int) -> list[Received]:
         """The events in a frame."""
 
     def record(self, item: Item, t_ns: int) -> bytes:
-        """A frame as it stands in its log."""
+        """The bytes of a frame in its log."""
 
     def counts(self) -> dict[str, int]:
-        """What became of the frames so far."""
+        """Frames so far, counted by what was done with them."""
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """What an input works for: the part of the daemon that takes its frames."""
+
+    clock: Clock  # stamps the receipts
+    wake: Callable[[], None]  # called when an empty inbox fills
+    is_alive: Callable[[], bool]  # whether the estimator works: an input answers its peer only then
+
+

@@ -1,25 +1,24 @@
-"""What the live outputs have in common: a bounded outbox between the estimator and their threads, and their health.
+"""The interface of live outputs, and the bounded outbox between the estimator and an output's thread.
 
-Each output sends in a thread of its own, so that a consumer that is slow or dead holds up neither the estimator nor
-another output. When the outbox of an output is full the oldest message is dropped and counted: what is new is worth more.
-An output whose sending never waits may have states handed to it at once instead, without the way through its thread.
+Each output sends in a thread of its own: a slow or dead consumer delays neither the estimator nor another output. When an
+outbox is full, the oldest message is dropped and counted. An output whose sending never waits can get states directly in
+the estimator's thread.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from threading import Condition, Event
 from typing import Any, Protocol
 
-from fusiond.config.schema import Config
 from fusiond.messages.latency import RecentLatencies
 from fusiond.messages.types import Message, StateMessage
+from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import LiveInput
-from fusiond_adapters.host.clock import HostClock
 
-POLL_S = 0.2  # how long an output's thread waits for messages before it looks whether it is to stop
+POLL_S = 0.2  # an output's thread looks at least this often whether it should stop
 
 
 class OutputLost(Exception):
@@ -32,45 +31,54 @@ class Outbox:
     def __init__(self, size: int, wants: tuple[type[Message], ...]) -> None:
         """`wants` are the kinds of messages that are let in."""
         self.offered = self.dropped = 0
-        self.latency = RecentLatencies()  # from the instant of a state to its being taken, or sent at once
+        self.latency = RecentLatencies()  # from the instant of a state to its being taken, or sent directly
         self.at_once: Callable[[StateMessage], bool] | None = None
-        """Sends a state in the estimator's thread, and never waits. False: it cannot just now, and the state is queued."""
+        """Sends a state in the estimator's thread, and never waits. False: it could not, and the state is queued."""
+        self.patience_s = 0.0
+        """How long `put` may wait for room before it drops the oldest message; 0 in a live run. With patience, `put` queues
+        states too, so that none is lost."""
         self._wants = wants
         self._messages: deque[Message] = deque(maxlen=size)
-        self._filled = Condition()
+        self._stalled = False  # it waited in vain, and nothing has been taken since
+        self._changed = Condition()
         self._now: Callable[[], int] | None = None
         self._on_opened: Callable[[], None] | None = None
 
     def attend(self, now: Callable[[], int], on_opened: Callable[[], None]) -> None:
-        """Before a session: `on_opened` is called in the output's thread when that first takes messages, and so is open;
-        from then on latencies are measured by `now`."""
+        """Before a session: `on_opened` is called in the output's thread when it first takes messages, which means that it
+        is open. Latencies are measured by `now`."""
         self._now, self._on_opened = now, on_opened
 
-    def put(self, message: Message) -> None:
-        """Leave a message, if it is of a wanted kind. Never waits for the reader."""
+    def put(self, message: Message, *, may_wait: bool = True) -> None:
+        """Add a message, if it is of a wanted kind. Without `patience_s` it never waits for the reader; the reader's own
+        thread must not wait (`may_wait`)."""
         if not isinstance(message, self._wants):
             return
-        with self._filled:
+        with self._changed:
             self.offered += 1
-        if type(message) is StateMessage and (send := self.at_once) and send(message):
+        if type(message) is StateMessage and not self.patience_s and (send := self.at_once) and send(message):
             if self._now:
                 self.latency.add(max(0, self._now() - message.t_ns))
             return
-        with self._filled:
-            self.dropped += len(self._messages) == self._messages.maxlen
+        with self._changed:
+            if may_wait and self.patience_s and self._is_full() and not self._stalled:
+                self._stalled = not self._changed.wait_for(lambda: not self._is_full(), self.patience_s)
+            self.dropped += self._is_full()
             self._messages.append(message)
-            self._filled.notify()
+            self._changed.notify_all()
 
     def take(self, timeout_s: float) -> list[Message]:
-        """All that was left since the last time, oldest first; waits up to `timeout_s` for the first. Empty after that."""
+        """The messages put since the last time, oldest first; waits up to `timeout_s` for the first. Empty after that."""
         if self._on_opened:
             on_opened, self._on_opened = self._on_opened, None
             on_opened()
-        with self._filled:
+        with self._changed:
             if not self._messages:
-                self._filled.wait(timeout_s)
+                self._changed.wait(timeout_s)
             messages = list(self._messages)
             self._messages.clear()
+            self._stalled = False
+            self._changed.notify_all()
         if self._now:
             now = self._now()
             for message in messages:
@@ -78,10 +86,18 @@ class Outbox:
                     self.latency.add(max(0, now - message.t_ns))
         return messages
 
+    @property
+    def waiting(self) -> int:
+        """Messages that nobody has taken yet."""
+        return len(self._messages)
+
+    def _is_full(self) -> bool:
+        return len(self._messages) == self._messages.maxlen
+
     def rouse(self) -> None:
-        """Let a waiting `take` return: there is something other than messages to look at, such as a stop."""
-        with self._filled:
-            self._filled.notify_all()
+        """Make a waiting `take` return, for instance because the output should stop."""
+        with self._changed:
+            self._changed.notify_all()
 
 
 class LiveOutput(Protocol):
@@ -92,21 +108,20 @@ class LiveOutput(Protocol):
     outbox: Outbox
 
     def session(self, stop: Event) -> None:
-        """Open, send what the outbox gets until told to stop (and then what is left in it), close. Raises OutputLost."""
+        """Open, send what the outbox gets until `stop` is set, then what is left in it, close. Raises OutputLost."""
 
     def counts(self) -> dict[str, int]:
-        """What became of the messages so far."""
+        """Messages so far, counted by what was done with them."""
 
     def notes(self) -> dict[str, str]:
-        """What the health should tell of it, such as whether the autopilot uses what it is sent."""
+        """Notes for the health, such as whether the autopilot uses the state."""
 
 
 @dataclass(frozen=True)
 class Around:
-    """What an output may build on besides the configuration."""
+    """What an output can use besides the configuration."""
 
-    clock: HostClock  # the time line of all stamps
-    inputs: Mapping[str, LiveInput[Any]]  # by kind and name, such as mavlink.fc: to answer on the link one hears
+    clock: Clock  # the time line of all stamps
+    inputs: Mapping[str, LiveInput[Any]]  # by kind and name, such as mavlink.fc: to send over a link that is open anyway
 
 
-Factory = Callable[[Config, Around], Sequence[LiveOutput]]  # raises ConfigError, also where an extra is missing

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.filter.observations.barometric_height import GAS_CONSTANT, LAYERS, NOMINAL_RADIUS, STANDARD_GRAVITY
+from fusiond.maths.atmosphere import GAS_CONSTANT, LAYERS, STANDARD_GRAVITY, geopotential_height
 from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Barometer
 
@@ -22,6 +22,5 @@ def measure(barometer: Barometer, height: Array, random: np.random.Generator) ->
 def pressure(altitude: Array) -> Array:
     """The standard pressure [hPa] at geometric heights [m] of the troposphere."""
     base, _, temperature, gradient = LAYERS[0]
-    geopotential = NOMINAL_RADIUS * altitude / (NOMINAL_RADIUS + altitude)
-    ratio: Array = 1 + gradient * geopotential / temperature
+    ratio: Array = 1 + gradient * geopotential_height(altitude) / temperature
     return base / 100 * ratio ** (-STANDARD_GRAVITY / (GAS_CONSTANT * gradient))

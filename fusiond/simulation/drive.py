@@ -31,6 +31,7 @@ from fusiond.simulation.wire import (
     TimeMessages,
     WheelFrames,
 )
+from fusiond.units import MICROSECOND, MILLISECOND, SECOND, nanoseconds
 
 WHEEL_PHASE_S, STEERING_PHASE_S, SPEED_PHASE_S, BEACON_PHASE_S = 0.0013, 0.0027, 0.0041, 0.1  # beside whole instants
 PRESSURE_PHASE_S = 0.0119  # likewise
@@ -84,9 +85,9 @@ class _Sent:
     def receipt(self, host_offset_s: float) -> tuple[Stamps, Stamps]:
         """Which messages arrived, in order of receipt, and the microseconds of their receipt on the host's clock."""
         rows = np.flatnonzero(self.sent & self.passage.arrived)
-        t_receive_ns = self.passage.t_receive_ns[rows] + round(host_offset_s * 1e9)
+        t_receive_ns = self.passage.t_receive_ns[rows] + nanoseconds(host_offset_s)
         order = np.argsort(t_receive_ns, kind="stable")
-        return rows[order], t_receive_ns[order] // 1000
+        return rows[order], t_receive_ns[order] // MICROSECOND
 
 
 class _Simulation:
@@ -108,7 +109,7 @@ class _Simulation:
 
     def unix(self, t: Array) -> Stamps:
         """True Unix time [ns] of times from the start [s]."""
-        return self.scenario.start_ns + np.rint(t * 1e9).astype(np.int64)
+        return self.scenario.start_ns + np.rint(t * SECOND).astype(np.int64)
 
     def send(self, t_origin_ns: Stamps, transport: Transport, link: str, awake: Mask) -> _Sent:
         return _Sent(t_origin_ns, carry(t_origin_ns, transport, self.random[link]), awake)
@@ -142,7 +143,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
     t_pressure = run.instants(scenario.barometer.rate_hz, PRESSURE_PHASE_S)
     t_pressure_ns, height = run.unix(t_pressure), np.interp(t_pressure, run.trajectory.t, truth.height)
     pressures = barometer.measure(scenario.barometer, height, run.random["pressure"])
-    t_fix_arrival_ns = t_fix_ns + round(scenario.gnss.delay_ms * 1e6)
+    t_fix_arrival_ns = t_fix_ns + round(scenario.gnss.delay_ms * MILLISECOND)
     spoken = ~within(t_fix, scenario.gnss.outage_s)
     streams = [
         run.send_mavlink(
@@ -157,8 +158,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
     counters = run.frame_counters([*streams, *telemetry.values()])
     (i, t_i), (g, t_g), (s, t_s), (h, t_h), (p, t_p) = (stream.receipt(scenario.host.offset_s) for stream in streams)
     stamps = {
-        "unix": t_fix_ns // 1000,
-        "boot-arrival": run.clock.read(t_fix_arrival_ns) // 1000,
+        "unix": t_fix_ns // MICROSECOND,
+        "boot-arrival": run.clock.read(t_fix_arrival_ns) // MICROSECOND,
         "none": np.zeros_like(t_fix_ns),
     }[scenario.gnss.stamp]
     return Drive(
@@ -168,15 +169,15 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
         imu=ImuMessages(
             t_receive_us=t_i,
             counter=counters[0][i],
-            time_us=run.clock.read(t_sample_ns)[i] // 1000,
+            time_us=run.clock.read(t_sample_ns)[i] // MICROSECOND,
             specific_force_b=samples[0][i].astype(np.float32),
             angular_rate_b=samples[1][i].astype(np.float32),
         ),
         gnss=GnssMessages(t_g, counters[1][g], stamps[g], _rows(fixes, g)),
-        time=TimeMessages(t_s, counters[2][s], t_beacon_ns[s] // 1000, run.clock.read(t_beacon_ns)[s] // 1_000_000),
+        time=TimeMessages(t_s, counters[2][s], t_beacon_ns[s] // MICROSECOND, run.clock.read(t_beacon_ns)[s] // MILLISECOND),
         heartbeats=Heartbeats(t_h, counters[3][h]),
         wheels=_wheel_frames(run),
-        barometer=PressureMessages(t_p, counters[4][p], run.clock.read(t_pressure_ns)[p] // 1_000_000, pressures[p]),
+        barometer=PressureMessages(t_p, counters[4][p], run.clock.read(t_pressure_ns)[p] // MILLISECOND, pressures[p]),
         chatter=(*(_chatter(run) if scenario.wheels.chatter else ()), *_traffic(run)),
         telemetry=tuple(
             _received(run, message, sent, counter)
@@ -192,7 +193,7 @@ def _truth_and_imu(run: _Simulation) -> tuple[Truth, tuple[Array, Array]]:
     generators = (run.random["imu_bias"], run.random["imu_noise"], run.random["imu_vibration"])
     gyro, accel, gyro_bias, accel_bias = imu.measure(scenario.imu, trajectory.t, true, generators)
     truth = Truth(
-        t_ns=run.unix(trajectory.t) + round(scenario.host.offset_s * 1e9),
+        t_ns=run.unix(trajectory.t) + nanoseconds(scenario.host.offset_s),
         latitude=true.position[0],
         longitude=true.position[1],
         height=true.position[2],
@@ -222,16 +223,16 @@ def _telemetry(run: _Simulation) -> dict[str, _Sent]:
 
 def _received(run: _Simulation, message: str, sent: _Sent, counters: Stamps) -> Telemetry:
     rows, t_receive_us = sent.receipt(run.scenario.host.offset_s)
-    since_s = (sent.t_origin_ns - run.scenario.start_ns) / 1e9
+    since_s = (sent.t_origin_ns - run.scenario.start_ns) / SECOND
     instants = np.minimum((since_s * run.scenario.imu.rate_hz).astype(np.int64), len(run.trajectory.t) - 1)
-    boot_ms = run.clock.read(sent.t_origin_ns) // 1_000_000
+    boot_ms = run.clock.read(sent.t_origin_ns) // MILLISECOND
     return Telemetry(message, t_receive_us, counters[rows], boot_ms[rows], instants[rows])
 
 
 def _fix_instants(run: _Simulation) -> Array:
     """Receivers fix at whole multiples of their interval in Unix time."""
     rate = run.scenario.gnss.rate_hz
-    into_second = run.scenario.start_ns % 10**9 / 1e9
+    into_second = run.scenario.start_ns % SECOND / SECOND
     return run.instants(rate, float(np.ceil(into_second * rate - 1e-6) / rate - into_second))
 
 

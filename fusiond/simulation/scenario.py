@@ -59,7 +59,7 @@ class Transport(Section, frozen=True, kw_only=True):
     """What happens to a stream of messages on the way to the receiving host."""
 
     latency_ms: NotNegative = 2.0  # of every message
-    jitter_ms: NotNegative = 0.0  # mean of the exponential delay on top
+    jitter_ms: NotNegative = 0.0  # mean of the additional, exponential delay
     loss: Share = 0.0  # probability of losing a message
     reorder: bool = False  # a message may overtake another of its stream
 
@@ -68,7 +68,7 @@ class Reboot(Section, frozen=True, kw_only=True):
     """[[autopilot.reboot]]: the boot clock starts from 0 again."""
 
     at_s: NotNegative  # when
-    silence_s: NotNegative = 3.0  # nothing is sent for so long
+    silence_s: NotNegative = 3.0  # duration without messages
 
 
 class Autopilot(Section, frozen=True, kw_only=True):
@@ -76,7 +76,7 @@ class Autopilot(Section, frozen=True, kw_only=True):
 
     boot_s: NotNegative = 60.0  # how long it has been running at the start
     drift_ppm: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0  # how much faster than true time its clock runs
-    telemetry: bool = False  # sends ATTITUDE and the like as well, as often as PX4 does to an onboard computer
+    telemetry: bool = False  # send ATTITUDE and similar messages too, as often as PX4 does to an onboard computer
     reboot: list[Reboot] = field(default_factory=list)
     transport: Transport = field(default_factory=Transport)
 
@@ -88,22 +88,22 @@ class Host(Section, frozen=True, kw_only=True):
 
 
 class Imu(Section, frozen=True, kw_only=True):
-    """[imu]: HIGHRES_IMU; each sample tells of the very instant of its stamp."""
+    """[imu]: HIGHRES_IMU; each sample is measured at its stamp."""
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 100.0  # samples a second
     position_m: Vector = (1.2, 0.0, -0.6)  # where it sits
     mount_deg: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw of its axes against the vehicle
     accel_noise: NotNegative = 3e-3  # white noise density [m/s^2/sqrt(Hz)]
     gyro_noise: NotNegative = 2e-4  # white noise density [rad/s/sqrt(Hz)]
-    accel_bias: Vector | None = None  # first bias [m/s^2]; default: drawn with the sigma below
-    gyro_bias: Vector | None = None  # first bias [rad/s]; default: drawn with the sigma below
-    accel_bias_sigma: NotNegative = 0.05  # of the first bias, where drawn [m/s^2]
-    gyro_bias_sigma: NotNegative = 2e-3  # of the first bias, where drawn [rad/s]
+    accel_bias: Vector | None = None  # initial bias [m/s^2]; default: random, with the sigma below
+    gyro_bias: Vector | None = None  # initial bias [rad/s]; default: random, with the sigma below
+    accel_bias_sigma: NotNegative = 0.05  # of a random initial bias [m/s^2]
+    gyro_bias_sigma: NotNegative = 2e-3  # of a random initial bias [rad/s]
     accel_bias_walk: NotNegative = 1e-4  # random walk [m/s^2/sqrt(s)]
     gyro_bias_walk: NotNegative = 5e-6  # random walk [rad/s/sqrt(s)]
     accel_resolution: NotNegative = 0.0  # step of the reading [m/s^2]; 0: none
     gyro_resolution: NotNegative = 0.0  # step of the reading [rad/s]; 0: none
-    vibration_hz: list[Positive] = field(default_factory=list)  # narrow bands, alike in every axis
+    vibration_hz: list[Positive] = field(default_factory=list)  # narrow bands, the same in every axis
     vibration_mps2: NotNegative = 0.0  # amplitude of each band at 10 m/s, grows with speed
     vibration_deg_s: NotNegative = 0.0  # the same on the gyro
     vibration_width_hz: NotNegative = 1.0  # width of a band
@@ -120,7 +120,7 @@ class Jump(Section, frozen=True, kw_only=True):
 
 
 class Spoof(Section, frozen=True, kw_only=True):
-    """[[gnss.spoof]]: position drifts off at a constant rate, and the velocity tells the same story."""
+    """[[gnss.spoof]]: the position drifts off at a constant rate, and the velocity agrees with it."""
 
     start_s: NotNegative  # from
     stop_s: NotNegative = math.inf  # back to the truth then
@@ -152,7 +152,7 @@ class Gnss(Section, frozen=True, kw_only=True):
 
 
 class Slip(Section, frozen=True, kw_only=True):
-    """[[wheels.slip]]: a wheel turns faster (spin) or slower (lock) than the road passes."""
+    """[[wheels.slip]]: a wheel turns faster (spin) or slower (lock) than it moves over the road."""
 
     wheel: WheelName  # which
     start_s: NotNegative  # from
@@ -172,15 +172,15 @@ class Wheels(Section, frozen=True, kw_only=True):
     """[wheels]: one CAN frame with the four wheels' speeds, 15 bits each, a counter and a fault bit."""
 
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0  # frames a second
-    scale_error: Annotated[float, Meta(gt=-0.5, lt=0.5)] = 0.0  # every wheel reads so much too fast (0.01 = 1 %)
+    scale_error: Annotated[float, Meta(gt=-0.5, lt=0.5)] = 0.0  # every wheel reads too high by this fraction (0.01 = 1 %)
     scale_errors: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # each wheel's own, in the order of WHEELS
     sigma_mps: NotNegative = 0.02  # white noise of a reading; a standing wheel has none
     resolution_kmh: Positive = 0.01  # step of the signal
-    unsigned: bool = True  # the amount only, not the direction
+    unsigned: bool = True  # magnitude only, no direction
     least_mps: NotNegative = 0.0  # slower wheels read 0
     slip: list[Slip] = field(default_factory=list)
     stuck: list[Stuck] = field(default_factory=list)
-    fault_s: list[Interval] = field(default_factory=list)  # the fault bit is set and the speeds are rubbish
+    fault_s: list[Interval] = field(default_factory=list)  # the fault bit is set and the speeds are invalid
     silent_s: list[Interval] = field(default_factory=list)  # no frames
     chatter: bool = True  # other frames on the bus as well (0x025, 0x0B4)
     traffic_hz: Annotated[float, Meta(ge=0, le=10_000)] = 0.0  # frames a second of further ids (a car's: 1000 and more)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Autopilot, Interval, Transport
+from fusiond.units import MILLISECOND, nanoseconds
 
 Stamps = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -30,8 +31,8 @@ def carry(t_origin_ns: Stamps, transport: Transport, random: np.random.Generator
     """Send messages on their way; the draws depend on their number only."""
     jitter = random.exponential(1.0, len(t_origin_ns)) * transport.jitter_ms
     arrived = random.random(len(t_origin_ns)) >= transport.loss
-    t_depart_ns = t_origin_ns + round(transport.latency_ms * 1e6)
-    t_receive_ns = t_depart_ns + np.rint(jitter * 1e6).astype(np.int64)
+    t_depart_ns = t_origin_ns + round(transport.latency_ms * MILLISECOND)
+    t_receive_ns = t_depart_ns + np.rint(jitter * MILLISECOND).astype(np.int64)
     if not transport.reorder:
         t_depart_ns = t_receive_ns = np.maximum.accumulate(t_receive_ns)
     return Passage(t_depart_ns, t_receive_ns, arrived)
@@ -41,11 +42,11 @@ class BootClock:
     """The autopilot's clock: from 0 at each boot, a little fast or slow; times are true Unix time [ns]."""
 
     def __init__(self, autopilot: Autopilot, start_ns: int) -> None:
-        boots = [start_ns - round(autopilot.boot_s * 1e9)]
+        boots = [start_ns - nanoseconds(autopilot.boot_s)]
         silences = [0]
         for reboot in sorted(autopilot.reboot, key=lambda reboot: reboot.at_s):
-            boots.append(start_ns + round(reboot.at_s * 1e9))
-            silences.append(round(reboot.silence_s * 1e9))
+            boots.append(start_ns + nanoseconds(reboot.at_s))
+            silences.append(nanoseconds(reboot.silence_s))
         self._boots, self._silences = np.array(boots, np.int64), np.array(silences, np.int64)
         self._rate = 1 + autopilot.drift_ppm * 1e-6
 

@@ -28,6 +28,7 @@ from fusiond.simulation.barometer import CENTI_CELSIUS
 from fusiond.simulation.gnss import FIX_3D, Fixes
 from fusiond.simulation.scenario import WHEELS
 from fusiond.simulation.transport import Mask, Stamps
+from fusiond.units import MICROSECOND, MILLISECOND
 
 LINK, BUS, IMU, GNSS, BAROMETER, SYSTEM = "fcu", "car", "imu0", "gps0", "baro0", 1  # the names in the matching configuration
 BOOT_CLOCK = boot_clock(LINK, SYSTEM)
@@ -48,7 +49,7 @@ class ImuMessages:
         columns = (self.t_receive_us, self.time_us, self.specific_force_b, self.angular_rate_b)
         for sequence, (t_us, time_us, force, rate) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
             payload = ImuSample(tuple(force), tuple(rate))
-            yield Received(IMU, sequence, BOOT_CLOCK, time_us * 1000, t_us * 1000, payload)
+            yield Received(IMU, sequence, BOOT_CLOCK, time_us * MICROSECOND, t_us * MICROSECOND, payload)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class GnssMessages:
             zip(*(c.tolist() for c in (self.t_receive_us, self.time_us, *columns)), strict=True)
         ):
             clock = (UNIX_CLOCK if time_us >= UNIX_FROM_US else BOOT_CLOCK) if time_us else ""
-            stamp = (clock, time_us * 1000 if time_us else None, t_us * 1000)
+            stamp = (clock, time_us * MICROSECOND if time_us else None, t_us * MICROSECOND)
             if fix_type < FIX_3D:
                 yield Received(f"{GNSS}.position", sequence, *stamp, Invalid("no fix"))
                 continue
@@ -103,7 +104,7 @@ class PressureMessages:
         columns = (self.t_receive_us, self.boot_ms, self.hectopascal)
         for sequence, (t_us, boot_ms, hectopascal) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
             payload = Pressure(hectopascal * 100.0, CENTI_CELSIUS / 100 + 273.15)
-            yield Received(BAROMETER, sequence, BOOT_CLOCK, boot_ms * 10**6, t_us * 1000, payload)
+            yield Received(BAROMETER, sequence, BOOT_CLOCK, boot_ms * MILLISECOND, t_us * MICROSECOND, payload)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +119,8 @@ class TimeMessages:
     def events(self) -> Iterator[Received]:
         columns = (self.t_receive_us, self.unix_us, self.boot_ms)
         for sequence, (t_us, unix_us, boot_ms) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-            pair = ClockPair(BOOT_CLOCK, boot_ms * 10**6)
-            yield Received(f"{LINK}.time", sequence, UNIX_CLOCK, unix_us * 1000, t_us * 1000, pair)
+            pair = ClockPair(BOOT_CLOCK, boot_ms * MILLISECOND)
+            yield Received(f"{LINK}.time", sequence, UNIX_CLOCK, unix_us * MICROSECOND, t_us * MICROSECOND, pair)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +160,7 @@ class WheelFrames:
             last = counter
             for name, value in zip(WHEELS, raw, strict=True):
                 payload = complaint or WheelSpeed(value * self.resolution_kmh * (1 / 3.6))
-                yield Received(name, sequence, "", None, t_us * 1000, payload)
+                yield Received(name, sequence, "", None, t_us * MICROSECOND, payload)
 
 
 @dataclass(frozen=True, slots=True)

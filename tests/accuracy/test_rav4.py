@@ -9,7 +9,9 @@ import msgspec
 import pytest
 
 from fusiond.app.replay.comparison import TruthReport, Window
-from fusiond.app.replay.replay import Options, Replay, Wants, parse_withheld, replay
+from fusiond.app.replay.intervals import parse_withheld
+from fusiond.app.replay.job import Options, replay
+from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as configuration
 from fusiond.config.schema import Config
 from fusiond.filter.calibration import calibrations

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fusiond.app.demo.demo import DRIVE, LOGS
-from fusiond.app.replay.replay import Options, replay
+from fusiond.app.replay.job import Options, replay
 from fusiond.config import load as config
 from fusiond.filter.kernel import interpreted
 

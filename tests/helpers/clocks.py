@@ -1,4 +1,4 @@
-"""What the tests of the clock share: stamped events, and series of them."""
+"""Stamped events, and series of them, for the tests of the clock."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from fusiond.events import (
     boot_clock,
 )
 from fusiond.timeline.clock import Clock
+from fusiond.units import MILLISECOND as MS
+from fusiond.units import SECOND
 from tests.helpers.paths import CAPTURED
 
-MS = 1_000_000
-SECOND = 1_000 * MS
 HOUR = 3_600 * SECOND
 YEAR = 8_766 * HOUR
 T0 = 1_700_000_000 * SECOND  # Unix time at which the autopilot booted

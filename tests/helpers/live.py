@@ -1,4 +1,4 @@
-"""What the tests of the live daemon share: a configuration, an autopilot's frames, a daemon in a thread."""
+"""A configuration, an autopilot's frames and a daemon in a thread, for the tests of the live daemon."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from pathlib import Path
 from queue import Queue
 from threading import Condition, Thread
 
+import can
 from pymavlink.dialects.v20 import common
 
 from fusiond.app.live.daemon import Daemon
 from fusiond.config import load as config
 from fusiond.config.schema import Config
+from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
 from fusiond.ports.outputs import LiveOutput
+from tests.helpers.network import DEADLINE, Send
 
-DEADLINE = 15.0  # s, for anything awaited
 SYSTEM, COMPONENT = 7, 1
 DBC = """VERSION ""
 BU_: ECU
@@ -182,3 +184,33 @@ def running(
         yield run
     finally:
         run.stop()
+
+
+def axle(left: int = 0, right: int = 0) -> can.Message:
+    data = left.to_bytes(2, "little") + right.to_bytes(2, "little") + bytes(4)
+    return can.Message(arbitration_id=256, is_extended_id=False, data=data)
+
+
+def drive(run: Running, send: Send, bus: can.BusABC | None, until: Callable[[], bool], autopilot: Autopilot) -> None:
+    """Play an autopilot, and wheels, until something holds: one IMU sample after each publication."""
+    source = run.daemon.inputs["mavlink.fc"]
+    run.until(lambda: source.counts()["sessions"] == 1)
+    for round_ in range(1500):
+        if until():
+            return
+        published = len(run.messages)
+        send(autopilot.imu())
+        if round_ % 20 == 0:
+            send(autopilot.heartbeat() + autopilot.gps())
+        if bus is not None and round_ % 2 == 0:
+            bus.send(axle())
+        run.until(lambda published=published: len(run.messages) > published)
+    raise AssertionError(f"not reached: {run.daemon.status()} {run.daemon.losses()}")
+
+
+def aligned(run: Running) -> bool:
+    return bool(run.messages) and run.messages[-1].mode is Mode.NOMINAL
+
+
+def fused(run: Running, source: str) -> int:
+    return run.daemon.live.engine.fusion.outcomes()[source]["FUSED"]

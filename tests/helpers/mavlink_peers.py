@@ -1,4 +1,4 @@
-"""What the tests of MAVLink out share: states of a moving vehicle, peers over UDP and TCP, and stand-ins for autopilots.
+"""States of a moving vehicle, peers over UDP and TCP, and stand-ins for autopilots, for the tests of MAVLink outputs.
 
 The stand-ins drop and refuse what ArduPilot and PX4 do, and turn what they take into latitude, longitude and velocity
 over ground by the autopilots' own equations. Sources: ArduPilot's GCS_Common.cpp (handle_odometry,
@@ -23,16 +23,18 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fusiond.config.schema import Config
 from fusiond.estimator.solution import Estimate, Mode, StateEstimate
 from fusiond.maths.rotation import matrix_from_euler, quaternion
-from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
+from fusiond.messages.from_solution import state_message
+from fusiond.messages.types import OutcomeCounts, State, StateMessage
 from fusiond.ports.inputs import Inbox
+from fusiond.units import MILLISECOND as MS
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.mavlink.link import MavlinkLink
 from fusiond_adapters.mavlink.talk import MavlinkTalk
-from tests.helpers.live import DEADLINE, configuration
+from tests.helpers.live import configuration
+from tests.helpers.network import DEADLINE
 
 SYSTEM, COMPONENT = 7, 1
 CLOCK = HostClock()
-MS = 10**6  # ns
 Triple = tuple[float, float, float]
 
 
@@ -262,7 +264,7 @@ class Taken(NamedTuple):
 
 
 class ArduPilot:
-    """With the EKF's origin where the test puts it. `dropped` counts what it drops without a word."""
+    """With the EKF's origin where the test puts it. `dropped` counts what it drops silently."""
 
     M_PER_E7 = 0.011131884502145034  # LOCATION_SCALING_FACTOR
 
@@ -362,3 +364,8 @@ def rotated(q: Any, v: Triple) -> Triple:
     t = 2 * np.cross(u, v)
     x, y, z = (np.array(v) + w * t + np.cross(u, t)).tolist()
     return x, y, z
+
+
+def state_of(state: StateMessage) -> State:
+    assert state.state is not None
+    return state.state

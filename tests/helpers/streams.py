@@ -18,9 +18,9 @@ from fusiond.filter.state import ERROR_SIZE, PHASE, POSITION_E, QUATERNION_EB, R
 from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import EARTH_RATE, ecef, geodetic, gravity_e, mat_ne, radii
+from fusiond.units import MILLISECOND as MS
+from fusiond.units import SECOND, nanoseconds
 
-MS = 1_000_000  # ns
-SECOND = 1_000 * MS
 T0 = 1_700_000_000 * SECOND
 MUNICH = (math.radians(48.1), math.radians(11.6), 520.0)  # rad, rad, m
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -125,7 +125,7 @@ def measurements(
     events: list[Measurement] = []
 
     def add(source: str, k: int, sequence: int, payload: Payload, offset_ns: int = 0) -> None:
-        t_ns = T0 + round(float(truth.seconds[k]) * 1e9) + offset_ns
+        t_ns = T0 + nanoseconds(float(truth.seconds[k])) + offset_ns
         events.append(Measurement(t_ns, source, sequence, t_ns + 5 * MS, payload))
 
     def noise(sigma: float, size: int = 3) -> Array:
@@ -145,7 +145,7 @@ def measurements(
     for place, name in enumerate(wheels):
         for i, k in enumerate(range(place, len(truth.seconds) - 1, round(1 / wheel_hz / step))):
             reading = abs(float(truth.speed[k] + noise(0.05, 1)[0])) if abs(truth.speed[k]) > 0.1 else 0.0
-            add(name, k, i, WheelSpeed(reading), round(step * 1e9) // 4 * (place % 3))
+            add(name, k, i, WheelSpeed(reading), nanoseconds(step) // 4 * (place % 3))
     return sorted(events, key=lambda event: event.key)
 
 

@@ -138,7 +138,7 @@ def replayed_alike(file: Path, box: Path, payloads: list[bytes]) -> str:
     that Zenoh dropped on their way are told. Raises Failed."""
     from fusiond.app.replay.replay import Replay, Wants  # noqa: PLC0415
     from fusiond.config import load as config  # noqa: PLC0415 - installed by the check before
-    from fusiond.messages.types import encode  # noqa: PLC0415
+    from fusiond.messages.codec import encode  # noqa: PLC0415
     from fusiond_adapters.logs.merge import open_logs  # noqa: PLC0415
 
     settings = config.load(file)

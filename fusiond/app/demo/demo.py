@@ -24,11 +24,12 @@ import msgspec
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.progress import shown
 from fusiond.app.replay.comparison import TruthReport
-from fusiond.app.replay.replay import Options, OutputError, replay
+from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.summary import Stretch, Summary
 from fusiond.config import load as config
 from fusiond.config.schema import Config
-from fusiond.messages.types import StateMessage, csv_row
+from fusiond.errors import OutputError
+from fusiond.messages import StateMessage, csv_row
 from fusiond_adapters.can.bus import CanBus
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs.play import PlayedClock, Player
@@ -44,9 +45,9 @@ POLL_S = 0.01
 WIDTH = 96  # characters of the explanation
 
 
-def run(out: Path, speed: float) -> None:
+def run(out: Path, speed: float, *, publish: bool = False) -> None:
     """Play the bundled drive at `speed` times real time into a daemon, write track.csv, summary.json and track.png to a
-    folder, and explain them on stdout.
+    folder, and explain them on stdout. With `publish` the daemon publishes over Zenoh.
 
     Raises OutputError.
     """
@@ -56,9 +57,11 @@ def run(out: Path, speed: float) -> None:
         raise OutputError(f"{out}: cannot be made: {error.strerror}") from error
     drawing = importlib.util.find_spec("matplotlib") is not None
     print(_paragraph(INTRODUCTION.format(speed=f"{speed:g}")), flush=True)
+    if publish:
+        print("\n" + _paragraph(PUBLISHED), flush=True)
     with TemporaryDirectory(prefix="fusiond-demo-") as box:
         settings = _settings(box)
-        played = _play(settings, speed)
+        played = _play(settings, speed, publish=publish)
         summary = replay(
             Options(
                 config=settings,
@@ -84,6 +87,9 @@ A car drives through a town for two and a half minutes: bends, a hill, a stop. I
 and a GNSS receiver over MAVLink, its wheel speeds come over CAN. The drive was made by fusiond's simulator in the true
 wire formats, so what really happened is known. It is now played to a running fusiond, over UDP and a virtual CAN bus,
 up to {speed} times as fast as it happened."""
+PUBLISHED = """\
+Meanwhile it is published over Zenoh, as of the vehicle "demo": run `fusiond top` in another terminal of this machine.
+With --speed 1 the drive lasts two and a half minutes."""
 
 
 @dataclass
@@ -114,8 +120,8 @@ def _settings(box: str) -> Config:
     )
 
 
-def _play(settings: Config, speed: float) -> Played:
-    """Run a daemon while the drive is played to it. Raises OutputError where its inputs do not open."""
+def _play(settings: Config, speed: float, *, publish: bool) -> Played:
+    """Run a daemon while the drive is played to it. Raises OutputError where its inputs or outputs do not open."""
     states: list[StateMessage] = []
     port = int(next(iter(settings.mavlink.values())).connection.rpartition(":")[2])
     with (
@@ -124,7 +130,7 @@ def _play(settings: Config, speed: float) -> Played:
     ):
         is_true = speed == 1
         clock = HostClock(player.begin_ns - LEAD_NS) if is_true else PlayedClock(player.begin_ns, speed)
-        daemon = Daemon(settings, sinks=[states.append], zenoh=False, clock=clock)
+        daemon = Daemon(settings, sinks=[states.append], zenoh=publish, clock=clock)
         asyncio.run(_run_while_played(daemon, player))
     received = sum(source.inbox.received for source in daemon.inputs.values())
     decoders = [source.decoder for source in daemon.inputs.values() if isinstance(source, CanBus)]
@@ -142,7 +148,8 @@ def _play(settings: Config, speed: float) -> Played:
 
 
 async def _run_while_played(daemon: Daemon, player: Player) -> None:
-    halt = Event()
+    """Raises OutputError."""
+    halt, obstacle = Event(), ""
 
     def play() -> None:
         played = player.play(daemon.clock, lambda: daemon.live.engine.now_ns, halt)
@@ -152,18 +159,29 @@ async def _run_while_played(daemon: Daemon, player: Player) -> None:
     async with asyncio.TaskGroup() as group:
         group.create_task(daemon.run())
         try:
-            async with asyncio.timeout(OPEN_S):
-                while not all(source.counts()["sessions"] for source in daemon.inputs.values()):
-                    await asyncio.sleep(POLL_S)
-            await asyncio.to_thread(play)
-            received = -1
-            while received != (received := sum(source.inbox.received for source in daemon.inputs.values())):
-                await asyncio.sleep(SETTLE_S)
-        except TimeoutError as error:
-            raise OutputError("the demonstration's own inputs do not open") from error
+            obstacle = await _obstacle(daemon)
+            if not obstacle:
+                await asyncio.to_thread(play)
+                received = -1
+                while received != (received := sum(source.inbox.received for source in daemon.inputs.values())):
+                    await asyncio.sleep(SETTLE_S)
         finally:
             halt.set()
             daemon.stop()
+    if obstacle:
+        raise OutputError(obstacle)
+
+
+async def _obstacle(daemon: Daemon) -> str:
+    """Wait until inputs and outputs are open. What keeps them from it; empty where nothing does."""
+    try:
+        async with asyncio.timeout(OPEN_S):
+            await daemon.up.wait()
+            while not all(source.counts()["sessions"] for source in daemon.inputs.values()):
+                await asyncio.sleep(POLL_S)
+    except TimeoutError:
+        return "the demonstration's own inputs do not open"
+    return "; ".join(daemon.outputs.failures.values())
 
 
 def _live(played: Played, track: list[str]) -> str:

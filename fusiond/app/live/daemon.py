@@ -1,64 +1,48 @@
 """The daemon: `fusiond run`. Inputs, estimator and outputs, each in a thread of its own; the event loop supervises them.
 
 The estimator's thread also feeds systemd's watchdog and lets the heartbeats go out, so that both stop when it does. An
-input that fails is opened again after a pause that grows; it takes nothing else down. So is an output: Zenoh is one of
-them. The end is orderly: inputs first, then what they left is fused, recorded and published, then the outputs.
+input or output that fails takes nothing else down: see `supervisor`. The end is orderly: inputs first, then what they left
+is fused, recorded and published, then the outputs.
 """
 
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
-import signal
-import sys
 import time
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from operator import attrgetter
 from threading import Event, current_thread
 from typing import Any
 
 from fusiond.app.live.estimator_thread import Estimator
+from fusiond.app.live.inputs import Inputs
 from fusiond.app.live.live_engine import LiveEngine
+from fusiond.app.outputs import Outputs
 from fusiond.app.state_file import StateFile
 from fusiond.config.changes import changes
-from fusiond.config.schema import Config, sensor_tables
+from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.filter.stored_state import to_text
+from fusiond.messages import EventMessage, HealthMessage, LatencyHealth, Message, OutputHealth, StateMessage
 from fusiond.messages.info import config_message, info_message
 from fusiond.messages.schedule import Surroundings
-from fusiond.messages.types import (
-    EventMessage,
-    HealthMessage,
-    InputHealth,
-    LatencyHealth,
-    Message,
-    OutputHealth,
-    StateMessage,
-)
-from fusiond.ports.inputs import Inbox, InputLost, LiveInput
-from fusiond.ports.outputs import Around, LiveOutput, OutputLost
-from fusiond_adapters.can.bus import CanBus
+from fusiond.ports.inputs import LiveInput, Receiver
+from fusiond.ports.outputs import Around, LiveOutput
 from fusiond_adapters.host import journal
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.host.systemd import Notifier, watchdog_s
 from fusiond_adapters.logs.black_box import Recorder
-from fusiond_adapters.mavlink.decoder import message_id
-from fusiond_adapters.mavlink.link import MavlinkLink
-from fusiond_adapters.registry import make_outputs
+from fusiond_adapters.registry import make_inputs, make_outputs
 
-FIRST_PAUSE_S = 0.1  # before what was lost is opened again; doubled each time, up to live.reopen_max_s
-STEADY_S = 10.0  # what lasted so long begins anew with the first pause
-SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
-CAN_ID = attrgetter("arbitration_id")
+POOL = 4  # threads: the estimator's, one that writes the stored state, two that wait for inputs and outputs
 REPORT_S = 10.0  # between two lines about losses, while there are any
 
 LEVEL = {"info": logging.INFO, "notice": logging.INFO, "warning": logging.WARNING, "critical": logging.CRITICAL}
 
 log = logging.getLogger("fusiond")
 
-Sink = Callable[[StateMessage], None]
+StateSink = Callable[[StateMessage], None]
 
 
 class Daemon:
@@ -72,7 +56,7 @@ class Daemon:
         self,
         config: Config,
         load: Callable[[], Config] | None = None,
-        sinks: Sequence[Sink] = (),
+        sinks: Sequence[StateSink] = (),
         outputs: Sequence[LiveOutput] = (),
         *,
         zenoh: bool = True,
@@ -86,20 +70,18 @@ class Daemon:
             stored = self._state_file.stored
         self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._surroundings, stored=stored)
         self._wake = Event()  # the estimator: there is something to do
-        self.inputs = self._make_inputs(config)
-        self.outputs = make_outputs(config, Around(self.clock, self.inputs)) | {one.name: one for one in outputs}
+        self.inputs = Inputs(self._make_inputs(config), self._max_pause_s, self.stop)
+        made = make_outputs(config, Around(self.clock, self.inputs)) | {one.name: one for one in outputs}
         if not zenoh:
-            del self.outputs["zenoh"]
+            del made["zenoh"]
+        self.outputs = Outputs(made.values(), self.clock.now_ns, self._introduction, self._max_pause_s)
         self.published = self.reloads = 0
         self.up = asyncio.Event()  # every input is prepared, and every output has been tried
         self.health: HealthMessage | None = None  # the latest
         self.estimator = Estimator(self.live, self.inputs, self.clock, self._wake, self._after_turn)
         self._load, self._sinks = load, sinks
-        self._stopping = asyncio.Event()
-        self._stops: dict[str, Event] = {}  # ends the session of an input
-        self._wrong: ConfigError | None = None  # what an input found when it was prepared
-        self._outputs_over = asyncio.Event()  # the estimator has ended: there is no more to come
-        self._stop_output = Event()  # and so the sessions of the outputs are to end
+        self._stopping = Event()
+        self._over = asyncio.Event()  # the estimator has ended: there is no more to come
         self._recorder: Recorder | None = None
         self._mode: str | None = None
         self._told: dict[str, int] = {}  # losses as last logged
@@ -108,12 +90,11 @@ class Daemon:
         self._next_feed_s = self._next_report_s = 0.0  # monotonic
 
     def stop(self) -> None:
-        """Ask for the end. Call it from the event loop's thread."""
+        """Ask for the end. From any thread."""
         if not self._stopping.is_set():
+            self._stopping.set()
             self._notifier.stopping()
-        self._stopping.set()
-        for event in self._stops.values():
-            event.set()
+        self.inputs.stop()
 
     async def run(self) -> None:
         """Run until asked to stop. Raises OSError where the black box's folder cannot be made, ConfigError where the
@@ -121,107 +102,70 @@ class Daemon:
         self._open_recorder()
         if self._recorder and self._state_file and self._state_file.stored:
             self._recorder.add("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
-        workers = len(self.inputs) + len(self.outputs) + 3
-        executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="fusiond")
+        executor = ThreadPoolExecutor(max_workers=POOL, thread_name_prefix="fusiond")
         try:
+            self.inputs.start()
+            self.outputs.start()
             async with asyncio.TaskGroup() as group:
-                prepared = {key: asyncio.Event() for key in self.inputs}
-                inputs = [
-                    group.create_task(self._supervise(key, source, executor, prepared[key]), name=source.about)
-                    for key, source in self.inputs.items()
-                ]
-                estimator = group.create_task(self._estimate(executor), name="estimator")
-                estimator.add_done_callback(lambda _: self._stop_outputs())
-                group.create_task(self._finish_after(inputs))
-                tried = {name: asyncio.Event() for name in self.outputs}
-                for name, output in self.outputs.items():
-                    group.create_task(self._keep(output, executor, tried[name]), name=output.about)
-                group.create_task(self._come_up([*prepared.values(), *tried.values()]))
+                group.create_task(self._come_up(executor))
+                group.create_task(self._estimate(executor))
+                group.create_task(_in_thread(executor, self._finish_after_inputs))
                 if self._state_file:
                     group.create_task(self._keep_state(self._state_file, executor), name="state file")
         finally:
-            for event in self._stops.values():
-                event.set()
+            self.inputs.stop()
             self.estimator.finish()
-            self._stop_outputs()
+            self.outputs.stop()
             executor.shutdown(wait=True)
+            self.inputs.join()
+            self.outputs.join()
             if self._recorder:
                 self._recorder.close()
             self._notifier.close()
-        if self._wrong:
-            raise self._wrong
+        if self.inputs.fault:
+            raise self.inputs.fault
         log.info("ended: %s", self.status(), extra={"MESSAGE_ID": journal.ENDED})
 
-    # --- Inputs
-
     def _make_inputs(self, config: Config) -> dict[str, LiveInput[Any]]:
-        size = config.live.queue_frames
-        links = [
-            MavlinkLink(config, link, Inbox(size, self._wake.set, message_id), self.clock, self._is_alive)
-            for link in config.mavlink
-        ]
-        buses = [CanBus(config, bus, Inbox(size, self._wake.set, CAN_ID), self.clock) for bus in config.can]
-        return {f"{kind}.{source.name}": source for kind, made in (("mavlink", links), ("can", buses)) for source in made}
+        return make_inputs(config, Receiver(self.clock, self._wake.set, self._is_alive))
 
     def _is_alive(self) -> bool:
         return self.estimator.is_alive()
 
-    async def _supervise(
-        self, key: str, source: LiveInput[Any], executor: ThreadPoolExecutor, prepared: asyncio.Event
-    ) -> None:
-        """Prepare an input, and keep it open until the daemon is to stop."""
-        loop = asyncio.get_running_loop()
+    def _max_pause_s(self) -> float:
+        return self.config.live.reopen_max_s
 
-        async def session() -> None:
-            stop = self._stops[key] = Event()
-            await loop.run_in_executor(executor, _run, key, source.session, stop)
-
-        try:
-            await loop.run_in_executor(executor, _run, key, source.prepare)
-        except ConfigError as wrong:
-            self._wrong = wrong
-            self.stop()
-        finally:
-            prepared.set()
-        await self._keep_open(source, session, self._stopping)
-
-    async def _keep_open(
-        self,
-        what: LiveInput[Any] | LiveOutput,
-        session: Callable[[], Awaitable[None]],
-        over: asyncio.Event,
-    ) -> None:
-        """Open something again and again, after pauses that grow as long as it does not last."""
-        loop = asyncio.get_running_loop()
-        pause, complaint = FIRST_PAUSE_S, ""
-        while not over.is_set():
-            began = loop.time()
-            try:
-                await session()
-                pause, complaint = FIRST_PAUSE_S, ""  # asked to end
-                continue
-            except (InputLost, OutputLost) as lost:
-                reason = str(lost)
-            except Exception as fault:  # a driver's fault must take nothing else down; it is told whole
-                reason = f"failed: {fault!r}"
-                log.exception("%s failed", what.about, extra={"FUSIOND_SOURCE": what.name})
-            if loop.time() - began > STEADY_S:
-                pause, complaint = FIRST_PAUSE_S, ""
-            if reason != complaint:
-                about = {"FUSIOND_SOURCE": what.name, "MESSAGE_ID": journal.CONNECTION_LOST}
-                log.warning("%s: %s; trying again", what.about, reason, extra=about)
-                complaint = reason
-            await _first(over, pause)
-            pause = min(2 * pause, self.config.live.reopen_max_s)
+    async def _come_up(self, executor: ThreadPoolExecutor) -> None:
+        await _in_thread(executor, self.inputs.wait_until_prepared)
+        await _in_thread(executor, self.outputs.wait_until_tried)
+        if self.inputs.fault:
+            return
+        self.up.set()
+        self._notifier.ready(self.status())
+        parts = [source.about for source in self.inputs.values()] + [output.about for output in self.outputs.values()]
+        log.info("up: %s", ", ".join(parts), extra={"MESSAGE_ID": journal.STARTED})
 
     # --- The estimator
 
     async def _estimate(self, executor: ThreadPoolExecutor) -> None:
-        await asyncio.get_running_loop().run_in_executor(executor, _run, "estimator", self.estimator.run)
+        """Run the estimator to its end, then let the outputs send what they have."""
+        try:
+            await _in_thread(executor, self._run_estimator)
+        finally:
+            self._over.set()
+            self.outputs.stop()
+        await _in_thread(executor, self.outputs.join)
 
-    async def _finish_after(self, inputs: Iterable[asyncio.Task[None]]) -> None:
-        for task in inputs:
-            await task
+    def _run_estimator(self) -> None:
+        thread = current_thread()
+        pooled, thread.name = thread.name, "estimator"
+        try:
+            self.estimator.run()
+        finally:
+            thread.name = pooled
+
+    def _finish_after_inputs(self) -> None:
+        self.inputs.join()
         self.estimator.finish()
 
     def _after_turn(self) -> None:
@@ -240,16 +184,16 @@ class Daemon:
         """Store the newest state again and again, and at the end, in a thread: a disk may be slow."""
         over = False
         while not over:
-            await _first(self._outputs_over, self.config.state.every_s)
-            over = self._outputs_over.is_set()
+            await _first(self._over, self.config.state.every_s)
+            over = self._over.is_set()
             newest = await asyncio.wrap_future(self.estimator.ask(self.live.engine.fusion.to_store))
             if newest is not None:
                 await asyncio.get_running_loop().run_in_executor(executor, file.write, newest)
 
-    # --- Outputs
+    # --- What goes out
 
     def _publish(self, message: Message) -> None:
-        """Leave a message with every output, and log what people may want to know."""
+        """Leave a message with every output, and log what people may want to know. The engine's sink."""
         if isinstance(message, StateMessage):
             for sink in self._sinks:
                 sink(message)
@@ -259,84 +203,36 @@ class Daemon:
             self.health = message
         elif isinstance(message, EventMessage):
             log.log(LEVEL[message.severity], "%s", message.text, extra=journal.about(message.kind, message.subject))
-        for output in self.outputs.values():
-            output.outbox.put(message)
+        self.outputs.put(message)
 
-    async def _keep(self, output: LiveOutput, executor: ThreadPoolExecutor, tried: asyncio.Event) -> None:
-        """Keep an output open until the estimator has ended. `tried` is set when it is open, or could not be opened."""
-        loop = asyncio.get_running_loop()
-
-        def opened() -> None:
-            self._introduce(output)
-            loop.call_soon_threadsafe(tried.set)
-
-        async def session() -> None:
-            output.outbox.attend(self.clock.now_ns, opened)
-            try:
-                await loop.run_in_executor(executor, _run, output.name, output.session, self._stop_output)
-            finally:
-                tried.set()
-
-        await self._keep_open(output, session, self._outputs_over)
-
-    def _introduce(self, output: LiveOutput) -> None:
-        """Leave with an output what is told once only."""
-        output.outbox.put(info_message(self.config, self.live.engine.fusion))
-        output.outbox.put(config_message(self.config))
-
-    def _stop_outputs(self) -> None:
-        self._stop_output.set()
-        self._outputs_over.set()
-        for output in self.outputs.values():
-            output.outbox.rouse()
-
-    async def _come_up(self, parts_done: Iterable[asyncio.Event]) -> None:
-        for event in parts_done:
-            await event.wait()
-        if self._wrong:
-            return
-        self.up.set()
-        self._notifier.ready(self.status())
-        parts = [source.about for source in self.inputs.values()] + [output.about for output in self.outputs.values()]
-        log.info("up: %s", ", ".join(parts), extra={"MESSAGE_ID": journal.STARTED})
+    def _introduction(self) -> list[Message]:
+        """What is sent once."""
+        return [info_message(self.config, self.live.engine.fusion), config_message(self.config)]
 
     # --- Watching it, reloading it
 
     def status(self) -> str:
         """The state of things in one line."""
-        latency = self.live.to_publication.report()
+        latency = self.outputs.handed_over.report()
         late = "" if latency is None else f", latency p50 {latency.p50:g} ms p99 {latency.p99:g} ms"
         return f"{self._mode or 'no data yet'}, {self.live.offered} measurements, {self.published} published{late}"
 
     def _surroundings(self) -> Surroundings:
         """What the health tells of inputs, outputs and latency."""
-        inputs = {
-            key: InputHealth(received=source.inbox.received, dropped=source.inbox.dropped, counts=source.counts())
-            for key, source in self.inputs.items()
-        }
-        outputs = {
-            name: OutputHealth(
-                offered=output.outbox.offered,
-                dropped=output.outbox.dropped,
-                latency_ms=output.outbox.latency.report(),
-                counts=output.counts(),
-                notes=output.notes(),
-            )
-            for name, output in self.outputs.items()
-        }
+        outputs = self.outputs.health()
         if box := self._recorder:
             notes = {"error": box.error} if box.error else {}
             outputs["record"] = OutputHealth(offered=box.written + box.lost, dropped=box.lost, counts={}, notes=notes)
         if file := self._state_file:
             outputs["state"] = file.health(self.live.engine.fusion.hot_start())
-        latency = LatencyHealth(fused=self.live.to_fusion.report(), published=self.live.to_publication.report())
-        return Surroundings(latency, inputs, outputs)
+        latency = LatencyHealth(fused=self.live.to_fusion.report(), published=self.outputs.handed_over.report())
+        return Surroundings(latency, self.inputs.health(), outputs)
 
     def losses(self) -> dict[str, int]:
         """What was lost so far, by kind; all of it is counted, none of it is silent."""
         found = {f"{key} frames dropped": source.inbox.dropped for key, source in self.inputs.items()}
         found |= {f"{key} frames lost before receipt": source.inbox.missed for key, source in self.inputs.items()}
-        found |= {f"{name} messages dropped": output.outbox.dropped for name, output in self.outputs.items()}
+        found |= {f"{name} messages dropped": dropped for name, dropped in self.outputs.dropped().items()}
         found["stamps moved"] = self.live.moved
         found["states not stored"] = self._state_file.lost if self._state_file else 0
         return found | {"records lost": self._recorder.lost if self._recorder else 0}
@@ -374,15 +270,9 @@ class Daemon:
         self._notifier.ready(self.status())
 
     def _adopt(self, new: Config, keys: Sequence[str]) -> None:
-        rates = any(key.partition(".")[0] in sensor_tables() for key in keys)
-        for name, source in self.inputs.items():
-            if any(key.startswith(f"{name}.") for key in keys) or (rates and name.startswith("mavlink.")):
-                source.configure(new)
-                if name in self._stops:
-                    self._stops[name].set()
+        self.inputs.configure(new, keys)
         self.config = new
-        for output in self.outputs.values():
-            self._introduce(output)
+        self.outputs.introduce()
         if any(key.startswith("record.") for key in keys):
             last = self._recorder
             self._open_recorder()
@@ -396,14 +286,8 @@ class Daemon:
         self.live.record = self._recorder.add if self._recorder else None
 
 
-def _run(name: str, call: Callable[..., None], *arguments: Any) -> None:
-    """A call in a thread of the pool, which bears its name meanwhile."""
-    thread = current_thread()
-    pooled, thread.name = thread.name, name
-    try:
-        call(*arguments)
-    finally:
-        thread.name = pooled
+async def _in_thread(executor: ThreadPoolExecutor, call: Callable[[], None]) -> None:
+    await asyncio.get_running_loop().run_in_executor(executor, call)
 
 
 async def _first(event: asyncio.Event, seconds: float) -> None:
@@ -413,26 +297,3 @@ async def _first(event: asyncio.Event, seconds: float) -> None:
             await event.wait()
     except TimeoutError:
         return
-
-
-async def serve(daemon: Daemon) -> None:
-    """Run a daemon as the process's only task, under its signals: SIGTERM and SIGINT end it, SIGHUP reloads."""
-    loop = asyncio.get_running_loop()
-    for number, action in ((signal.SIGTERM, daemon.stop), (signal.SIGINT, daemon.stop), (signal.SIGHUP, daemon.reload)):
-        loop.add_signal_handler(number, action)
-    sys.setswitchinterval(SWITCH_S)
-    tidying = asyncio.create_task(_tidy(daemon))
-    try:
-        await daemon.run()
-    finally:
-        tidying.cancel()
-        gc.enable()
-
-
-async def _tidy(daemon: Daemon) -> None:
-    """Once it is up: keep the garbage collector from going through all modules again and again, for 30 ms each time, and
-    from working between an instant and its state: the estimator sees to it."""
-    await daemon.up.wait()
-    gc.collect()
-    gc.freeze()
-    gc.disable()

@@ -93,9 +93,9 @@ class Estimator:
         if late:
             time.sleep(CATCH_UP_S)
         more = live.step(self._inputs, give_way=not late and speed == 1.0)
-        if live.unfinished:
+        if live.engine.unfinished:
             time.sleep(GIVE_WAY_S)
-            live.finish_tick()
+            live.engine.flush()
         self._answer_all()
         self._beat_ns = self._clock.now_ns()
         self._on_turn()

@@ -8,7 +8,7 @@ moved, and how far, is counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from operator import itemgetter
 from typing import Any, Protocol
 
@@ -16,15 +16,13 @@ from fusiond.config.schema import Config
 from fusiond.engine import Engine
 from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
+from fusiond.messages import Message
 from fusiond.messages.latency import RecentLatencies
-from fusiond.messages.schedule import Publication, Surroundings
-from fusiond.messages.types import Message, StateMessage
+from fusiond.messages.schedule import Surroundings
 
 MICROSECOND = 1_000  # ns
-MOST_FRAMES = 256  # taken at once
+MAX_FRAMES = 256  # taken at once
 MOVED_NS = 100 * MICROSECOND  # less is only to tell apart frames that were read at once
-
-OnMessage = Callable[[Message], None]
 
 
 class Source(Protocol):
@@ -39,30 +37,26 @@ class Source(Protocol):
 
 
 class LiveEngine:
-    """Engine and inputs of a running daemon. `now` reads the time line; `on_message` takes whatever is to go out;
+    """Engine and inputs of a running daemon. `now` reads the time line; `sink` takes whatever is to go out;
     `surroundings` tells the health of the shell; `record` takes kind of file, stamp, bytes; `stored` is for a hot start."""
 
     def __init__(
         self,
         config: Config,
         now: Callable[[], int],
-        on_message: OnMessage,
+        sink: Callable[[Message], None],
         surroundings: Callable[[], Surroundings] = Surroundings,
         record: Callable[[str, int, bytes], None] | None = None,
         stored: StoredState | None = None,
     ) -> None:
-        self.engine = Engine(config, config.publish.rate_hz, self._tick, stored=stored)
-        self.publication = Publication(config, self.engine, surroundings)
+        self.engine = Engine(config, sink, surroundings=surroundings, stored=stored)
         self.record = record
         self.moved = self.most_moved_ns = 0  # stamps, see above
         self.offered = 0  # measurements given to the fusion
         self.to_fusion = RecentLatencies()  # from receipt to having been fused
-        self.to_publication = RecentLatencies()  # from the instant of a tick to its being handed to the outputs
-        self._now, self._on_message = now, on_message
+        self._now = now
         self._last_ns = 0
         self._frames: list[tuple[int, Source, Any]] = []  # received, but not taken yet
-        self._others: Iterator[Message] = iter(())  # of the tick that was made last
-        self.unfinished = False  # whether there may be some
 
     @property
     def next_tick_ns(self) -> int | None:
@@ -73,21 +67,21 @@ class LiveEngine:
         """Take what the inboxes hold, and make the ticks that are due.
 
         With `give_way` it ends after a tick of which only the state has gone out, so that this reaches its readers before
-        the work on the other messages begins: they are left to `finish_tick`, and frames received after it to the next
-        step. So are frames beyond the first MOST_FRAMES: however great the load, whoever calls this comes round. Returns
+        the work on the other messages begins: they are left to `Engine.flush`, and frames received after it to the next
+        step. So are frames beyond the first MAX_FRAMES: however great the load, whoever calls this comes round. Returns
         whether frames are left.
         """
-        self.finish_tick()
+        self.engine.flush()
         frames = self._frames
-        if len(frames) < MOST_FRAMES:  # the others may wait where they are bounded
+        if len(frames) < MAX_FRAMES:  # the others may wait where they are bounded
             frames += [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
             frames.sort(key=itemgetter(0))
         for number, (t_ns, source, item) in enumerate(frames):
-            if number == MOST_FRAMES or (give_way and self._tick_before(t_ns)):
+            if number == MAX_FRAMES or (give_way and self._tick_before(t_ns)):
                 self._frames = frames[number:]
                 return True
             self._take(self._ordered(t_ns), source, item)
-            if give_way and self.unfinished:  # a tick that has waited for this frame
+            if give_way and self.engine.unfinished:  # a tick that has waited for this frame
                 self._frames = frames[number + 1 :]
                 return True
         self._frames = []
@@ -95,7 +89,7 @@ class LiveEngine:
         if due is not None and due <= now:
             self._elapse(now)
         if not give_way:
-            self.finish_tick()
+            self.engine.flush()
         return False
 
     def _tick_before(self, t_ns: int) -> bool:
@@ -111,12 +105,6 @@ class LiveEngine:
         self.engine.elapse(t_ns)
         self._last_ns = max(self._last_ns, t_ns // MICROSECOND * MICROSECOND)
 
-    def finish_tick(self) -> None:
-        """Everything but the state that goes out at the last tick; before anything else is taken."""
-        self.unfinished = False
-        for other in self._others:
-            self._on_message(other)
-
     def _ordered(self, t_ns: int) -> int:
         """The stamp under which a frame counts as received."""
         whole = t_ns // MICROSECOND * MICROSECOND
@@ -128,27 +116,16 @@ class LiveEngine:
         return whole
 
     def _take(self, t_ns: int, source: Source, item: Any) -> None:
-        taken = 0
+        usable = 0
         for event in source.decode(item, t_ns):
-            self.engine.advance(t_ns)
-            self.finish_tick()
-            receipt = self.engine.take(event)
+            receipt = self.engine.feed(event)
             if receipt is not None:
                 self.offered += 1
-                self.publication.add(event, receipt)
-                self.engine.taken(event)
-                taken += receipt.refusal is not Outcome.INVALID
-        if taken:
+                usable += receipt.refusal is not Outcome.INVALID
+        if usable:
             self.engine.fusion.history.catch_up()  # now, so that a tick finds it done
             late_ns = max(0, self._now() - t_ns)
-            for _ in range(taken):
+            for _ in range(usable):
                 self.to_fusion.add(late_ns)
         if self.record:
             self.record(source.file, t_ns, source.record(item, t_ns))
-
-    def _tick(self, since_start_ns: int, message: StateMessage) -> None:
-        self.finish_tick()
-        self._others = self.publication.at(since_start_ns, message)
-        self._on_message(next(self._others))
-        self.to_publication.add(max(0, self._now() - message.t_ns))
-        self.unfinished = True

@@ -13,6 +13,7 @@ from fusiond.filter.rows import Outcome
 from fusiond.messages.types import StateMessage
 
 CAPACITY = 6000  # samples kept of each kind: more than a picture has pixels across
+UNREAD_NS = 250_000_000  # a fix is looked up in the history so long after its receipt at the latest
 
 Item = TypeVar("Item")
 
@@ -65,9 +66,11 @@ class Trace:
         self.ticks: Thinned[TickSample] = Thinned()
         self.fixes: Thinned[FixSample] = Thinned()
         self.rejected: Thinned[FixSample] = Thinned()  # apart, so that thinning loses none of a few
+        self._unread: list[tuple[Receipt, FixSample]] = []  # fixes whose outcome has not been asked for
         self._origin: tuple[float, float, float] | None = None  # lat, lon [deg], height [m]
 
     def add_tick(self, message: StateMessage, errors: Errors | None) -> None:
+        self.read_outcomes()
         state = message.state
         if state is None:
             return
@@ -81,12 +84,23 @@ class Trace:
         self.ticks.add(TickSample(message.t_ns, north, east, state.yaw_deg, *sigmas, reckoned, errors, *true))
 
     def add_receipt(self, receipt: Receipt) -> None:
-        fix = receipt.measurement.payload
-        if not isinstance(fix, GnssPosition) or receipt.refusal is Outcome.INVALID:
-            return
-        north, east = self._place(math.degrees(fix.latitude), math.degrees(fix.longitude), fix.height)
-        kept = self.rejected if receipt.outcome is Outcome.REJECTED else self.fixes
-        kept.add(FixSample(receipt.measurement.t_ns, north, east))
+        """The outcome is asked for later: at once, the history would have to run its rows again for each late fix."""
+        measurement, fix = receipt.measurement, receipt.measurement.payload
+        if self._unread and measurement.t_receive_ns - self._unread[0][0].measurement.t_receive_ns > UNREAD_NS:
+            self.read_outcomes()
+        if isinstance(fix, GnssPosition) and receipt.refusal is not Outcome.INVALID:
+            north, east = self._place(math.degrees(fix.latitude), math.degrees(fix.longitude), fix.height)
+            self._unread.append((receipt, FixSample(measurement.t_ns, north, east)))
+
+    def read_outcomes(self) -> None:
+        """Ask for the outcomes of the fixes received lately; also to be called at the end."""
+        for receipt, sample in self._unread:
+            try:
+                rejected = receipt.outcome is Outcome.REJECTED
+            except LookupError:  # forgotten already: it came just inside the horizon
+                rejected = False
+            (self.rejected if rejected else self.fixes).add(sample)
+        self._unread.clear()
 
     def _place(self, lat_deg: float, lon_deg: float, height_m: float) -> tuple[float, float]:
         if self._origin is None:

@@ -9,21 +9,14 @@ from fusiond.config.schema import Barometer
 from fusiond.events import Pressure
 from fusiond.filter.observations.model import RESETS, Observation, Unusable, begin, empty_row
 from fusiond.filter.state import HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR, POSITION, POSITION_E, FilterState
-from fusiond.maths.portable import exp, log, square
+from fusiond.maths.atmosphere import geometric_height, pressure_altitude
+from fusiond.maths.portable import square
 from fusiond.maths.typed import Array, Vector, compiled
 from fusiond.maths.wgs84 import geodetic, mat_ne
 
 ALTITUDE, VARIANCE = 0, 1  # m, m^2: values
 
 PRESSURE_LIMITS = (1_000.0, 120_000.0)  # Pa: 31 km up, below the Dead Sea
-GAS_CONSTANT = 287.05287  # J/(kg K), of dry air
-STANDARD_GRAVITY = 9.80665  # m/s^2
-NOMINAL_RADIUS = 6_356_766.0  # m, of the Earth, between geopotential and geometric height
-LAYERS = (  # base: pressure [Pa], geopotential height [m], temperature [K], and its gradient above [K/m]
-    (101_325.0, 0.0, 288.15, -0.0065),
-    (22_632.040, 11_000.0, 216.65, 0.0),
-    (5_474.8774, 20_000.0, 216.65, 0.001),
-)
 
 
 def parameters(barometer: Barometer) -> Array:
@@ -36,17 +29,7 @@ def values(reading: Pressure, barometer: Barometer) -> tuple[float, ...]:
     """Pressure altitude [m], as a geometric height, and its variance [m^2]. Raises Unusable."""
     if not PRESSURE_LIMITS[0] <= reading.absolute <= PRESSURE_LIMITS[1]:
         raise Unusable("impossible pressure" if math.isfinite(reading.absolute) else "not finite")
-    geopotential = pressure_altitude(reading.absolute)
-    return NOMINAL_RADIUS * geopotential / (NOMINAL_RADIUS - geopotential), square(barometer.sigma_m)
-
-
-def pressure_altitude(pressure: float) -> float:
-    """Geopotential height [m] at which the standard atmosphere has a pressure [Pa], up to 32 km."""
-    base, height, temperature, gradient = next((layer for layer in LAYERS[:0:-1] if pressure < layer[0]), LAYERS[0])
-    depth = -GAS_CONSTANT / STANDARD_GRAVITY * log(pressure / base)  # m/K: height over temperature
-    if gradient == 0:
-        return height + temperature * depth
-    return height + temperature / gradient * (exp(gradient * depth) - 1)
+    return geometric_height(pressure_altitude(reading.absolute)), square(barometer.sigma_m)
 
 
 @compiled

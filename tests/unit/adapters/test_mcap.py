@@ -19,19 +19,24 @@ import pytest
 from fusiond.__main__ import SUCCESS, UNUSABLE, USAGE, main
 from fusiond.config.schema import Config, Mcap
 from fusiond.estimator.solution import Mode
-from fusiond.messages.types import EventMessage, HealthMessage, InnovationMessage, Message, StateMessage, csv_row, decode
+from fusiond.messages.codec import decode
+from fusiond.messages.csv import csv_row
+from fusiond.messages.types import EventMessage, HealthMessage, InnovationMessage, Message, StateMessage
 from tests.helpers.drive import LOGS, folder, messages, settings
-from tests.helpers.live import Autopilot, configuration, running
-from tests.unit.app.live.test_daemon import aligned, free_port, udp
-from tests.unit.app.live.test_daemon import drive as steer
+from tests.helpers.live import Autopilot, aligned, configuration, running
+from tests.helpers.live import drive as steer
+from tests.helpers.network import free_port, udp
 
 pytest.importorskip("mcap", reason="the extra mcap is not installed")
 
 from mcap.reader import make_reader
+from pymavlink.dialects.v20 import common
 
 from fusiond.ports.outputs import OutputLost
 from fusiond_adapters import mcap as ours
 from fusiond_adapters.foxglove.converter import Converter, Record
+from fusiond_adapters.logs.play import mavlink_records
+from fusiond_adapters.logs.tlog import STAMP
 from fusiond_adapters.mcap import McapFile, McapRecorder, repair
 
 DEADLINE = 15.0  # s
@@ -62,6 +67,40 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Read, list[str],
     command = ["replay", "--config", str(folder() / "fusiond.toml"), *logs]
     assert main([*command, "--mcap", str(out / "a.mcap"), "--csv", str(out / "a.csv")]) == SUCCESS
     return read(out / "a.mcap"), (out / "a.csv").read_text().splitlines()[1:], out / "a.mcap"
+
+
+# --- What is not in a file
+
+
+@pytest.mark.parametrize(
+    ("boot_us", "force", "updated"),
+    [(64_000_000, math.nan, 0x3F), (964_000_000, 0.0, 0x3F), (64_000_000, 0.0, 0)],
+    ids=["not a number", "stamped in the future", "nothing updated"],
+)
+def test_a_drive_with_an_unusable_inertial_sample_can_be_written(
+    tmp_path: Path, boot_us: int, force: float, updated: int
+) -> None:
+    """It is no measurement that is judged, so it has no topic."""
+    records = list(mavlink_records(folder() / "drive.tlog"))
+    at = len(records) // 2
+    rest = (*(0.0,) * 7, updated, 0)
+    sample = common.MAVLink_highres_imu_message(boot_us, force, 0.0, -9.81, 0.0, 0.0, 0.0, *rest)
+    records.insert(at, (records[at][0], bytes(sample.pack(common.MAVLink(None, srcSystem=1, srcComponent=1)))))
+    (tmp_path / "drive.tlog").write_bytes(b"".join(STAMP.pack(t_ns // 1000) + frame for t_ns, frame in records))
+    logs = [str(tmp_path / "drive.tlog"), str(folder() / "drive.log")]
+    command = ["replay", "--config", str(folder() / "fusiond.toml"), *logs]
+    assert main([*command, "--mcap", str(tmp_path / "a.mcap"), "--json", str(tmp_path / "a.json")]) == SUCCESS
+    imu = json.loads((tmp_path / "a.json").read_bytes())["sources"]["imu0"]
+    assert imu["invalid"] == 1
+    assert len(read(tmp_path / "a.mcap")) > 1000
+
+
+def test_a_record_of_an_unknown_topic_is_counted_and_left_out(tmp_path: Path) -> None:
+    with McapFile(tmp_path / "a.mcap", settings()) as file:
+        file.add(Record("/fusiond/innovations/imu0", 1, 1, b"{}"))
+        file.add(Record("/fusiond/log", 1, 1, b"{}"))
+        assert file.unknown == 1
+    assert [topic for topic, *_ in read(tmp_path / "a.mcap")] == ["/fusiond/log"]
 
 
 # --- What is in a file

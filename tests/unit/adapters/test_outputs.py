@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -12,7 +11,6 @@ from pathlib import Path
 from threading import Condition, Event
 
 import can
-import msgspec
 import numpy as np
 import pytest
 
@@ -20,11 +18,7 @@ from fusiond.app.client import Client
 from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as config
 from fusiond.config.schema import Config, Zenoh
-from fusiond.engine import SECOND, Engine
-from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Received
-from fusiond.filter.rows import Outcome
-from fusiond.messages.innovations import NAMES
-from fusiond.messages.schedule import Publication
+from fusiond.messages.codec import encode
 from fusiond.messages.types import (
     ConfigMessage,
     EventMessage,
@@ -35,13 +29,12 @@ from fusiond.messages.types import (
     SettledMessage,
     StateAtInstant,
     StateMessage,
-    encode,
 )
 from fusiond.ports.outputs import Outbox, OutputLost
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.zenoh.session import open_session
-from tests.helpers.live import DEADLINE, Autopilot, Running, configuration, running
-from tests.unit.app.live.test_daemon import aligned, drive, free_port, fused
+from tests.helpers.live import Autopilot, Running, aligned, configuration, drive, fused, running
+from tests.helpers.network import DEADLINE, free_port
 
 CHANNELS = count()
 
@@ -124,22 +117,6 @@ def driven(
 
 def event(text: str) -> EventMessage:
     return EventMessage(vehicle="v", t_ns=1, kind="mode", severity="info", subject="", text=text)
-
-
-def test_a_full_outbox_drops_the_oldest_and_counts() -> None:
-    outbox = Outbox(3, (EventMessage,))
-    for number in range(5):
-        outbox.put(event(str(number)))
-    outbox.put(ConfigMessage(vehicle="v", config={}))  # not wanted
-    assert (outbox.offered, outbox.dropped) == (5, 2)
-    assert [message.text for message in outbox.take(0) if isinstance(message, EventMessage)] == ["2", "3", "4"]
-    assert outbox.take(0) == []
-
-
-def test_an_outbox_tells_once_that_it_is_attended() -> None:
-    outbox = Outbox(3, (Message,))
-    outbox.attend(lambda: 5, lambda: outbox.put(event("hello")))
-    assert [outbox.take(0), outbox.take(0)] == [[event("hello")], []]
 
 
 # --- Supervision
@@ -323,71 +300,6 @@ def test_a_reload_is_told(tmp_path: Path) -> None:
     assert told == [0.2, 0.3]
 
 
-# --- Resets
-
-
-class Player:
-    """An engine and its publication, played by hand."""
-
-    def __init__(self, settings: Config) -> None:
-        self.told: list[Message] = []
-        self._engine = Engine(settings, 10.0, lambda since, message: self.told.extend(self._publication.at(since, message)))
-        self._publication = Publication(settings, self._engine)
-
-    def play(self, seconds: float, begin_s: float = 0.0, metres_off: Callable[[float], float] = lambda _: 0.0) -> None:
-        """A vehicle at rest, whose receiver is off to the north by so many metres at a second."""
-        for number in range(round(seconds * 50)):
-            second, wobble = begin_s + number / 50, 0.01 * (number % 7 - 3)
-            self._take("imu0", second, ImuSample((wobble, 0.0, -9.81), (1e-4, wobble / 10, 0.0)))
-            if number % 10 == 0:
-                latitude = math.radians(48.0) + metres_off(second) / 6.4e6
-                self._take("gps0.position", second + 1e-3, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
-                self._take("gps0.velocity", second + 1e-3, GnssVelocity(0.0, 0.0, 0.0, 0.1))
-        self._engine.finish()
-
-    def _take(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
-        t_ns = 1_700_000_000 * SECOND + round(second * SECOND)
-        event = Received(source, t_ns, "unix", t_ns, t_ns, payload)
-        self._engine.advance(t_ns)
-        receipt = self._engine.take(event)
-        assert receipt is not None
-        self._publication.add(event, receipt)
-
-
-def test_a_reset_is_told_with_its_reason(tmp_path: Path) -> None:
-    """A receiver that stays 300 m away is believed in the end; before that its measurements are told as rejected."""
-    settings = configuration(tmp_path, "udpin:127.0.0.1:1")
-    settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, gnss_reset_s=10.0))
-    player = Player(settings)
-    player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
-    messages = player.told
-    why = "gps0.position was rejected, off alike all the time, and is now believed again"
-    events = [message for message in messages if isinstance(message, EventMessage)]
-    assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
-    assert [message.subject for message in events if message.kind == "mode"] == [
-        "aligning", "nominal", "dead_reckoning", "nominal",
-    ]  # fmt: skip
-    positions = [m for m in messages if isinstance(m, InnovationMessage) and m.source == "gps0.position"]
-    rejected = [message for message in positions if message.outcome == "rejected"]
-    assert len(rejected) > 40 and all((message.test_ratio or 0) > 1 for message in rejected)
-    assert rejected[0].innovation[0] == pytest.approx(300, abs=2)
-    health = [message for message in messages if isinstance(message, HealthMessage)]
-    assert (health[-1].resets, health[-1].reset_reason) == (1, why)
-    jump = next(message for message in health if message.resets == 1)
-    assert jump.t_ns == next(message.t_ns for message in events if message.kind == "reset")  # told at once
-
-
-def test_a_hole_in_the_data_is_told(tmp_path: Path) -> None:
-    settings = configuration(tmp_path, "udpin:127.0.0.1:1")
-    settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, restart_gap_s=3.0))
-    player = Player(settings)
-    player.play(2.0)
-    player.play(2.0, begin_s=7.0)
-    texts = [message.text for message in player.told if isinstance(message, EventMessage)]
-    assert "state reset: more than 3 s without data, or without the IMU until the heading was lost; aligning anew" in texts
-    assert "imu0: nothing received for 2 s" in texts
-
-
 # --- Zenoh
 
 
@@ -455,7 +367,3 @@ def test_a_stalled_subscriber_holds_up_nobody(tmp_path: Path, channel: str, bus:
         finally:
             release.set()
         assert run.daemon.outputs["zenoh"].outbox.dropped == 0
-
-
-def test_outcomes_all_have_names() -> None:
-    assert set(NAMES) == set(Outcome)

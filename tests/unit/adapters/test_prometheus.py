@@ -20,8 +20,10 @@ from fusiond.messages.types import (
     Quantiles,
     StateMessage,
 )
+from fusiond.units import SECOND
 from tests.helpers.drive import messages, settings
-from tests.unit.adapters.foxglove.test_converter import DEADLINE, serving
+from tests.helpers.network import DEADLINE
+from tests.helpers.serving import serving
 
 pytest.importorskip("prometheus_client", reason="the extra prometheus is not installed")
 
@@ -57,7 +59,7 @@ def scrape_after(told: list[Any]) -> Samples:
         last = [message for message in told if isinstance(message, StateMessage)][-1]
         for _ in range(1000):
             samples = scrape(server)
-            if samples.get(("fusiond_time_seconds", frozenset())) == last.t_ns / 1e9:
+            if samples.get(("fusiond_time_seconds", frozenset())) == last.t_ns / SECOND:
                 return samples
     raise AssertionError("the messages were not taken in")
 

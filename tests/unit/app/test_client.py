@@ -28,11 +28,10 @@ from fusiond.messages.types import (
 )
 from fusiond.ports.outputs import OutputLost
 from fusiond_adapters.zenoh.output import ZenohOutput
+from tests.helpers.estimates import random_messages as states
+from tests.helpers.network import DEADLINE, python, read_line
 from tests.helpers.paths import ROOT
-from tests.unit.adapters.zenoh.test_session import messages as states
-from tests.unit.adapters.zenoh.test_session import python, read_line
 
-DEADLINE = 15.0  # s
 CONFIG = ConfigMessage(vehicle="rover", config={"vehicle": {"name": "rover"}})
 HEALTH = HealthMessage(
     vehicle="rover", t_ns=1, version="1", uptime_s=1.0, mode=Mode.NOMINAL, resets=0, outcomes=OutcomeCounts(fused=5),

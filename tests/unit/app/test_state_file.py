@@ -23,12 +23,12 @@ from fusiond.estimator.solution import Mode
 from fusiond.filter.hot_start import Verdict
 from fusiond.filter.state import T
 from fusiond.filter.stored_state import StoredState, from_text, stored_state, to_text
-from fusiond.messages.types import encode
+from fusiond.messages.codec import encode
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers import streams
-from tests.helpers.live import Autopilot, Running, configuration, running
+from tests.helpers.live import Autopilot, Running, configuration, drive, running
+from tests.helpers.network import free_port, udp
 from tests.helpers.streams import running_state
-from tests.unit.app.live.test_daemon import drive, free_port, udp
 
 KEEP = '[state]\nfile = "state.json"\nevery_s = 1\n'
 CHANNELS = count()

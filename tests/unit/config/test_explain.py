@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from fusiond.config.explain import description, oddities
 from fusiond.config.load import parse
-from fusiond.config.schema import Config, sensor_tables
+from fusiond.config.schema import Config, Foxglove, Mcap, Prometheus, sensor_tables
+from tests.helpers.drive import settings
 
 TEXT = """
 [mavlink.fc]
@@ -104,3 +106,11 @@ def test_what_is_probably_not_meant(folder: Path, old: str, new: str, oddity: st
 def test_a_stream_that_is_turned_off_is_not_odd(folder: Path) -> None:
     off = TEXT.replace("velocity_delay_ms = 70.0", "velocity_delay_ms = 1500.0\nuse_velocity = false")
     assert list(oddities(read(folder, off))) == []
+
+
+def test_check_tells_what_is_on() -> None:
+    tables = {"mcap": Mcap(folder="out"), "foxglove": Foxglove(enabled=True), "prometheus": Prometheus(enabled=True)}
+    on = "\n".join(description(msgspec.structs.replace(settings(), **tables)))
+    off = "\n".join(description(settings()))
+    for told in ("ws://127.0.0.1:8765", "http://127.0.0.1:9464/metrics", "1024 MB at most"):
+        assert told in on and told not in off

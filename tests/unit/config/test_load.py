@@ -234,6 +234,39 @@ def test_bounds_of_the_learnt_noise_are_in_order(sensor: str) -> None:
     check(BASE + text, 7, f"{sensor}.noise_least", "must not exceed noise_most (2)")
 
 
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        ("", "tcp/127.0.0.1:7447 is where \\[zenoh\\] listens"),
+        ('odom_frame = "map"', "must differ"),
+        ("origin = [91.0, 0.0, 0.0]", "latitude must be in"),
+        ('namespace = "rover"', "namespace"),
+        ('map_frame = "/map"', "map_frame"),
+        ("domain = 233", "domain"),
+    ],
+)
+def test_contradictions_on_ros2(lines: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        config.parse(f"{BASE}\n[ros2]\nenabled = true\n{lines}\n", CAR)
+
+
+@pytest.mark.parametrize(
+    ("more", "key"),
+    [
+        ('[autopilot]\nlink = "none"', "autopilot.link"),
+        ('[autopilot]\nlink = "autopilot"\nkind = "px4"\nmessage = "gps_input"', "autopilot.message"),
+        ('[autopilot]\nlink = "autopilot"\nrate_hz = 150.0', "autopilot.rate_hz"),
+        ('[autopilot]\nlink = "autopilot"\nmessage = "gps_input"\ngps_id = 0', "autopilot.gps_id"),
+        ('[autopilot]\nlink = "autopilot"\nset_origin = true\nmessage = "gps_input"', "autopilot.set_origin"),
+        ('[ground_station]\nlink = "none"', "ground_station.link"),
+        ('[ground_station]\nlink = "autopilot"\nconnection = "udpout:127.0.0.1:1"', "ground_station.connection"),
+    ],
+)
+def test_contradictions_on_mavlink_outputs(more: str, key: str) -> None:
+    with pytest.raises(ConfigError, match=key):
+        config.parse(f"{BASE}\n[publish]\nrate_hz = 100.0\n[gnss.gps0]\nlink = \"autopilot\"\n{more}\n", CAR)
+
+
 def test_no_imu() -> None:
     check("[mavlink.autopilot]\n", 1, "imu", "exactly one [imu.NAME] is needed, found 0")
     assert complaint("").startswith(f"{CAR}:1: imu: ")

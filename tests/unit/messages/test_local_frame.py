@@ -1,7 +1,6 @@
 """States in local frames, against matrices put together independently; the odometry frame under corrections."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,43 +10,13 @@ from numpy.typing import NDArray
 from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion
 from fusiond.maths.wgs84 import ecef, mat_ne
 from fusiond.messages.local_frame import ENU_FLU, GAP_NS, NED_FRD, Convention, LocalFrame, LocalState, OdometryFrame, Placed
-from fusiond.messages.types import State
+from tests.helpers.estimates import random_state
 
 ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU = np.diag([1.0, -1.0, -1.0])
 EARTH_RATE_E = np.array([0.0, 0.0, 7.292115e-5])  # rad/s
 AXES = [(ENU_FLU, ENU, FLU), (NED_FRD, np.eye(3), np.eye(3))]
 ORIGIN = (math.radians(48.1), math.radians(11.6), 520.0)
-
-
-def state(seed: int = 3, **given: Any) -> State:
-    """A random state some kilometres from ORIGIN."""
-    random = np.random.default_rng(seed)
-
-    def triple() -> tuple[float, ...]:
-        return tuple(random.normal(size=3).tolist())
-
-    def covariance() -> tuple[float, ...]:
-        root = random.normal(size=(3, 3))
-        product = root @ root.T
-        return tuple(((product + product.T) / 2).ravel().tolist())
-
-    turned = random.normal(size=4)
-    values: dict[str, Any] = {
-        "lat_deg": 48.1 + 0.1 * random.normal(),
-        "lon_deg": 11.6 + 0.1 * random.normal(),
-        "height_m": 500.0 + random.normal(),
-        "velocity_ned_mps": triple(),
-        "quaternion_nb": tuple((turned / np.linalg.norm(turned)).tolist()),
-        **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg", "wheel_scale", "sigma_wheel_scale"), 0.0),
-        **dict.fromkeys(("sigma_velocity_mps", "sigma_yaw_deg"), 1.0),
-        **{name: covariance() for name in State.__struct_fields__ if name.startswith("covariance")},
-        "mount_deg": (0.0, 0.0),
-        "sigma_mount_deg": (0.0, 0.0),
-        "sigma_gyro_bias_rps": tuple(abs(x) for x in triple()),
-    }
-    rest = [name for name in State.__struct_fields__ if name not in values]
-    return State(**{**values, **{name: triple() for name in rest}, **given})
 
 
 def square(block: tuple[float, ...]) -> NDArray[np.float64]:
@@ -59,7 +28,7 @@ def square(block: tuple[float, ...]) -> NDArray[np.float64]:
 def test_a_state_far_from_the_origin(
     convention: Convention, world: NDArray[np.float64], body: NDArray[np.float64], seed: int
 ) -> None:
-    s = state(seed)
+    s = random_state(seed)
     position_e = ecef(math.radians(s.lat_deg), math.radians(s.lon_deg), s.height_m)
     mat_le = world @ mat_ne(ecef(*ORIGIN))
     mat_ln = mat_le @ mat_ne(position_e).T
@@ -88,14 +57,14 @@ def test_a_state_far_from_the_origin(
 def test_what_ros_people_expect() -> None:
     """At the origin, heading east, 10 m/s, turning right: along x, yaw 0, turning about -z."""
     east = tuple(quaternion(matrix_from_euler(0.0, 0.0, math.pi / 2)).tolist())
-    s = state(quaternion_nb=east, velocity_ned_mps=(0.0, 10.0, 0.0), angular_rate_b_rps=(0.0, 0.0, 0.5))
+    s = random_state(quaternion_nb=east, velocity_ned_mps=(0.0, 10.0, 0.0), angular_rate_b_rps=(0.0, 0.0, 0.5))
     local = LocalFrame.at(s).state(s)
     assert_allclose(local.position_l, 0.0, atol=1e-9)
     assert_allclose(np.abs(local.quaternion_lb), (1.0, 0.0, 0.0, 0.0), atol=1e-15)
     assert_allclose(local.velocity_l, (10.0, 0.0, 0.0), atol=1e-14)
     assert_allclose(local.velocity_b, (10.0, 0.0, 0.0), atol=1e-14)
     assert_allclose(local.angular_rate_l, (0.0, 0.0, -0.5), atol=1e-4)
-    up = LocalFrame.at(s).state(state(lat_deg=s.lat_deg, lon_deg=s.lon_deg, height_m=s.height_m + 7.0))
+    up = LocalFrame.at(s).state(random_state(lat_deg=s.lat_deg, lon_deg=s.lon_deg, height_m=s.height_m + 7.0))
     assert_allclose(up.position_l, (0.0, 0.0, 7.0), atol=1e-8)
 
 

@@ -37,3 +37,9 @@ def test_every_row_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (line,) = [line for line in lines if line.startswith((f"| {row}", f"|   {row}"))]
         assert re.search(r"\| [0-9.]+ x \|", line), line
     assert (tmp_path / "report.md").read_text().strip() == told.strip()
+
+
+def test_memory_is_that_of_the_child_alone() -> None:
+    mine = b"x" * 200_000_000  # which the child's ru_maxrss would begin at
+    _, peak_mb = run.run_python("-c", "pass")
+    assert peak_mb < len(mine) / 2e6

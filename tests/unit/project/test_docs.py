@@ -16,10 +16,11 @@ from fusiond.simulation import scenario
 from tests.helpers.paths import ROOT
 
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 LARGEST_PICTURE = 150_000  # bytes
+COLUMNS = 120  # of a line that is not of a table
 
 
 def load(name: str) -> ModuleType:
@@ -48,6 +49,11 @@ def test_tables_of_keys_are_up_to_date(name: str) -> None:
     assert load("make_configuration").page(name, text) == text, "run: python docs/make_configuration.py"
 
 
+def test_the_architecture_is_up_to_date() -> None:
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    assert load("make_architecture").page(text) == text, "run: python docs/make_architecture.py"
+
+
 def test_every_key_is_in_the_tables() -> None:
     text = (DOCS / "configuration.md").read_text(encoding="utf-8")
     for section in (sections.Filter, sections.Motion, sections.Gnss, sections.Wheel, sections.Record):
@@ -65,6 +71,12 @@ def test_links_resolve(page: Path) -> None:
         file = page.parent / name if name else page
         assert file.exists(), target
         assert not anchor or anchor in anchors(file), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_lines_are_short(page: Path) -> None:
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if len(line) > COLUMNS and not line.lstrip().startswith("|")] == []
 
 
 def test_every_page_is_linked_from_the_readme() -> None:

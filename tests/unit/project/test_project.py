@@ -11,9 +11,8 @@ import pytest
 
 from fusiond.app.demo import demo
 from fusiond.simulation import matching, scenario
-from tests.helpers.paths import ROOT
+from tests.helpers.paths import ROOT, ROOTS
 
-ROOTS = {"fusiond": ROOT / "fusiond", "fusiond_adapters": ROOT / "adapters"}
 MODULES = sorted(path for root in ROOTS.values() for path in root.rglob("*.py"))
 
 

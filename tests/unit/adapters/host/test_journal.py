@@ -98,9 +98,9 @@ def test_repeated_warnings_are_counted() -> None:
 
 def test_what_repeats_remembers_is_bounded() -> None:
     repeats = journal.Repeats(lambda: 0.0)
-    for number in range(10 * journal.MOST_KEPT):
+    for number in range(10 * journal.MAX_KEPT):
         repeats.filter(logging.makeLogRecord({"msg": f"{number}", "levelno": logging.ERROR}))
-    assert len(repeats._said) == journal.MOST_KEPT
+    assert len(repeats._said) == journal.MAX_KEPT
 
 
 def test_the_journal_is_told_from_other_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

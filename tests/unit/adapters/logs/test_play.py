@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,22 +15,22 @@ import pytest
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs import play
 from fusiond_adapters.logs.play import PlayedClock, Player, can_records, mavlink_records
-from fusiond_adapters.logs.tlog import STAMP
 from tests.helpers.live import Autopilot
 
 BEGIN_NS = 1_760_000_000_000_000_000
 STEP_NS = 10_000_000
 FRAMES = 5
 CHANNEL = "test-play"
+AUTOPILOT = Autopilot()
+SENT = [AUTOPILOT.imu() for _ in range(FRAMES)]
 
 
 @pytest.fixture
 def logs(tmp_path: Path) -> tuple[Path, Path]:
     """A MAVLink frame each 10 ms, a CAN frame 5 ms after it."""
-    autopilot = Autopilot()
     stamps = [BEGIN_NS + number * STEP_NS for number in range(FRAMES)]
     tlog, canlog = tmp_path / "drive.tlog", tmp_path / "drive.log"
-    tlog.write_bytes(b"".join(STAMP.pack(t_ns // 1000) + autopilot.imu() for t_ns in stamps))
+    tlog.write_bytes(b"".join(struct.pack(">Q", t // 1000) + frame for t, frame in zip(stamps, SENT, strict=True)))
     half = STEP_NS // 2
     lines = (f"({(t + half) // 10**9}.{(t + half) % 10**9 // 1000:06d}) can0 10{n}#0{n}\n" for n, t in enumerate(stamps))
     canlog.write_text("".join(lines))
@@ -44,7 +45,7 @@ def bus() -> Iterator[can.BusABC]:
 
 def test_records(logs: tuple[Path, Path]) -> None:
     assert [t_ns for t_ns, _ in mavlink_records(logs[0])] == [BEGIN_NS + number * STEP_NS for number in range(FRAMES)]
-    assert {frame[0] for _, frame in mavlink_records(logs[0])} == {0xFD}
+    assert [frame for _, frame in mavlink_records(logs[0])] == SENT
     assert [message.arbitration_id for _, message in can_records(logs[1])] == list(range(0x100, 0x100 + FRAMES))
 
 
@@ -59,7 +60,7 @@ def test_every_frame_arrives_in_order(logs: tuple[Path, Path], bus: can.BusABC, 
         ear.settimeout(5.0)
         with Player(*logs, ear.getsockname()[1], mouth) as player:
             stamps = list(player.play(clock, lambda: 0, Event()))
-        assert [ear.recv(512) for _ in range(FRAMES)] == [frame for _, frame in mavlink_records(logs[0])]
+        assert [ear.recv(512) for _ in range(FRAMES)] == SENT
     assert stamps == [BEGIN_NS + number * STEP_NS // 2 for number in range(2 * FRAMES)]
     assert clock.now_ns() >= stamps[-1]
     received = [bus.recv(5.0) for _ in range(FRAMES)]

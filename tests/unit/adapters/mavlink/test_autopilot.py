@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fusiond.config.toml import ConfigError
 from fusiond.estimator.solution import Mode
-from fusiond.maths.rotation import euler, matrix, matrix_from_euler
+from fusiond.maths.rotation import euler, matrix
 from fusiond.messages.types import State, StateMessage
 from fusiond_adapters.mavlink.autopilot import AutopilotOutput, Readback
-from fusiond_adapters.mavlink.outgoing import FORMS, Origin, Pace, ellipsoid_map, odometry, vision_position
-from fusiond_adapters.mavlink.transport import Whole
+from fusiond_adapters.mavlink.outgoing import FORMS, Origin, odometry
 from tests.helpers.live import configuration
 from tests.helpers.mavlink_peers import (
     CLOCK,
@@ -38,6 +36,7 @@ from tests.helpers.mavlink_peers import (
     recent,
     serving,
     state_at,
+    state_of,
 )
 
 ON = '[autopilot]\nlink = "fc"\nrate_hz = 25.0\n'
@@ -58,13 +57,8 @@ def udp() -> Iterator[UdpPeer]:
     made.close()
 
 
-def told(state: StateMessage) -> State:
-    assert state.state is not None
-    return state.state
-
-
 def position_of(state: StateMessage) -> tuple[float, float, float]:
-    return told(state).lat_deg, told(state).lon_deg, told(state).height_m
+    return state_of(state).lat_deg, state_of(state).lon_deg, state_of(state).height_m
 
 
 def diagonal(block: tuple[float, ...]) -> list[float]:
@@ -94,7 +88,7 @@ def test_the_autopilot_gets_the_state(peer: Peer, kind: str, message: str, tmp_p
     for m, state in zip(sent, states, strict=True):
         taken = autopilot.take(m)
         assert taken is not None
-        want = told(state)
+        want = state_of(state)
         metre = 1e-5  # deg
         assert taken.time_us == state.t_ns // 1000
         assert taken.latitude_deg == pytest.approx(want.lat_deg, abs=1e-3 * metre)
@@ -123,9 +117,9 @@ def check_variances(variances: tuple[float, ...], want: State, kind: str) -> Non
 
 def test_what_pleases_one_autopilot_is_refused_by_the_other() -> None:
     message = state_at(10**18, 3)
-    origin = Origin.of(told(message))
+    origin = Origin.of(state_of(message))
     here = position_of(message)
-    to_px4, to_ardupilot = (odometry(message, told(message), origin, FORMS[kind], 50) for kind in ("px4", "ardupilot"))
+    to_px4, to_ardupilot = (odometry(message, state_of(message), origin, FORMS[kind], 50) for kind in ("px4", "ardupilot"))
     ardupilot, px4 = ArduPilot(here), Px4(here)
     assert ardupilot.take(to_px4) is None and ardupilot.dropped == 1
     assert px4.take(to_ardupilot) is None and px4.refused == 1
@@ -152,7 +146,7 @@ def test_gps_input(udp: UdpPeer, tmp_path: Path) -> None:
     autopilot = ArduPilot(position_of(states[0]))
     for m, state in zip(ear.of("GPS_INPUT"), states, strict=True):
         taken = autopilot.take(m)
-        want = told(state)
+        want = state_of(state)
         assert m.gps_id == 1 and taken is not None and taken.quaternion is not None
         assert (taken.latitude_deg, taken.longitude_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-7)
         assert taken.height_m == pytest.approx(want.height_m - 47.5, abs=1e-4)
@@ -167,45 +161,6 @@ def test_gps_input(udp: UdpPeer, tmp_path: Path) -> None:
 
 
 # --- Numbers
-
-
-def test_angles_in_the_covariance_are_those_of_roll_pitch_and_yaw() -> None:
-    """Against finite differences of the Euler angles."""
-    message = state_at(10**18, 4)
-    state = told(message)
-    mat_nb = matrix(np.array(state.quaternion_nb))
-    step = 1e-6
-    columns = []
-    for axis in range(3):
-        turn = [step if axis == i else 0.0 for i in range(3)]
-        turned = euler(matrix_from_euler(*turn) @ mat_nb)
-        columns.append((np.array(turned) - np.array(euler(mat_nb))) / step)
-    jacobian = np.column_stack(columns)
-    want = jacobian @ np.array(state.covariance_attitude_rad2).reshape(3, 3) @ jacobian.T
-    covariance = vision_position(message, state, Origin.of(state), FORMS["px4"]).covariance
-    whole = np.zeros((6, 6))
-    whole[np.triu_indices(6)] = covariance
-    np.testing.assert_allclose(whole[3:, 3:][np.triu_indices(3)], want[np.triu_indices(3)], rtol=1e-4, atol=1e-9)
-    np.testing.assert_allclose(whole[:3, :3], np.triu(np.array(state.covariance_position_m2).reshape(3, 3)))
-    assert not whole[:3, 3:].any()
-
-
-def test_maps_differ_by_metres_and_cross_the_date_line() -> None:
-    origin = Origin(48.0, 179.99, 0.0)
-    for on in (FORMS["ardupilot"].on, FORMS["px4"].on, ellipsoid_map):
-        north, east = on(origin, 48.05, -179.99)
-        assert north == pytest.approx(5560, abs=10) and east == pytest.approx(1490, abs=5)
-    apart = FORMS["ardupilot"].on(origin, 48.05, 179.99)[0] - ellipsoid_map(origin, 48.05, 179.99)[0]
-    assert 4 < apart < 8  # m, in 5.6 km
-
-
-def test_pace_keeps_its_rate_between_ticks_of_another() -> None:
-    pace = Pace(30.0)
-    passed = [pace.due(tick * 20 * MS) for tick in range(500)]  # 10 s at 50 Hz
-    assert sum(passed) == 300
-    assert pace.due(60_000 * MS)
-    assert not pace.due(60_001 * MS)  # a pause is not made up for
-    assert not any(Pace(0.0).due(tick) for tick in range(3))
 
 
 # --- What is never sent
@@ -263,7 +218,7 @@ def test_the_origin_is_that_of_the_first_fit_state(tmp_path: Path) -> None:
     first, *_, last = [m for m in link.sent if m.get_type() == "ODOMETRY"]
     assert (first.x, first.y, first.z) == (0, 0, 0)
     assert last.z == pytest.approx(-6.5) and last.reset_counter == 3
-    assert output.origin == Origin.of(told(state_at(0, 1)))
+    assert output.origin == Origin.of(state_of(state_at(0, 1)))
 
 
 def test_a_state_that_waited_too_long_is_not_sent(tmp_path: Path) -> None:
@@ -294,7 +249,7 @@ def test_the_origin_is_set_until_the_autopilot_names_one(tmp_path: Path) -> None
     heartbeat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GROUND_ROVER, 3, 0, 0, 4, 3)
     link.talk.hear(bytes(heartbeat.pack(voice)), 0)
     output.offer(state_at(10**18 - 900 * MS))
-    state = told(state_at(0))
+    state = state_of(state_at(0))
     set_to = link.sent[1]
     assert set_to.get_type() == "SET_GPS_GLOBAL_ORIGIN" and set_to.target_system == SYSTEM
     assert set_to.latitude == round(state.lat_deg * 1e7) and set_to.altitude == round(state.height_m * 1e3)
@@ -375,7 +330,7 @@ def test_a_stalled_peer_delays_nobody_and_tears_no_frame(tmp_path: Path) -> None
     stalled = TcpPeer(buffer=4096)
     _, link = link_to(stalled, tmp_path, ON)
     ear = Ear(stalled)
-    message = odometry(state_at(0), told(state_at(0)), Origin.of(told(state_at(0))), FORMS["ardupilot"], 50)
+    message = odometry(state_at(0), state_of(state_at(0)), Origin.of(state_of(state_at(0))), FORMS["ardupilot"], 50)
     with serving(link):
         greeted(ear, link)
         slowest, lost, tries = 0.0, 0, 0
@@ -393,45 +348,4 @@ def test_a_stalled_peer_delays_nobody_and_tears_no_frame(tmp_path: Path) -> None
     stalled.close()
 
 
-def test_a_line_that_takes_parts_gets_whole_frames() -> None:
-    got, room = bytearray(), [0]
-
-    def write(data: bytes) -> int:
-        if room[0] == 0:
-            raise BlockingIOError
-        taken = min(room[0], len(data))
-        got.extend(data[:taken])
-        room[0] -= taken
-        return taken
-
-    line = Whole(write)
-    frames = [bytes([number]) * 10 for number in range(40)]
-    taken = []
-    for number, frame in enumerate(frames):
-        room[0] += number % 9
-        if line.put(frame):
-            taken.append(frame)
-    room[0] = 100
-    assert line.put(b"last")
-    assert bytes(got) == b"".join(taken) + b"last"
-    assert 5 < len(taken) < 30
-
-
 # --- Configuration
-
-
-@pytest.mark.parametrize(
-    ("more", "key"),
-    [
-        ('[autopilot]\nlink = "none"', "autopilot.link"),
-        (f"{ON}kind = 'px4'\nmessage = 'gps_input'", "autopilot.message"),
-        ('[autopilot]\nlink = "fc"\nrate_hz = 150.0', "autopilot.rate_hz"),
-        (f"{ON}message = 'gps_input'\ngps_id = 0", "autopilot.gps_id"),
-        (f"{ON}set_origin = true\nmessage = 'gps_input'", "autopilot.set_origin"),
-        ('[ground_station]\nlink = "none"', "ground_station.link"),
-        ('[ground_station]\nlink = "fc"\nconnection = "udpout:127.0.0.1:1"', "ground_station.connection"),
-    ],
-)
-def test_contradictions_are_refused(tmp_path: Path, more: str, key: str) -> None:
-    with pytest.raises(ConfigError, match=key):
-        configuration(tmp_path, "udpin:127.0.0.1:1", more)

@@ -18,10 +18,11 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
 from fusiond.app.replay.replay import Replay, Wants
-from fusiond.messages.types import encode
+from fusiond.messages.codec import encode
 from fusiond.timeline.clock import ClockReport
 from fusiond_adapters.logs.merge import open_logs
-from tests.helpers.live import DEADLINE, SYSTEM, Running, configuration, running
+from tests.helpers.live import SYSTEM, Running, configuration, running
+from tests.helpers.network import DEADLINE, free_port
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -104,12 +105,6 @@ class Autopilot:
         return common.MAVLink_system_time_message(0, us // 1000)
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def boot_report(run: Running) -> ClockReport | None:
     return run.daemon.live.engine.fusion.clock.report().get(f"fc/{SYSTEM}/boot")
 
@@ -136,7 +131,7 @@ def check(run: Running, autopilot: Autopilot) -> None:
 @pytest.mark.parametrize(("ours", "theirs"), [("udpin", "udpout"), ("udpout", "udpin"), ("tcp", "tcpin"), ("tcpin", "tcp")])
 def test_over_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours: str, theirs: str) -> None:
     monkeypatch.setenv("MAVLINK20", "1")
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     autopilot = Autopilot(f"{theirs}:127.0.0.1:{port}")
     with running(configuration(tmp_path, f"{ours}:127.0.0.1:{port}", MORE)) as run:
         if ours == "tcpin":
@@ -147,7 +142,7 @@ def test_over_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours:
 
 def test_replay_of_the_recording_measures_the_same_round_trips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAVLINK20", "1")
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     autopilot = Autopilot(f"udpout:127.0.0.1:{port}")
     settings = configuration(tmp_path, f"udpin:127.0.0.1:{port}", MORE + '[record]\nfolder = "box"\n')
     with running(settings) as run, autopilot.flying():
@@ -194,7 +189,7 @@ def test_over_a_serial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_two_links_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each link has an autopilot's clock of its own, and talks for itself."""
     monkeypatch.setenv("MAVLINK20", "1")
-    first, second = free_port(), free_port()
+    first, second = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
     more = f'[mavlink.aux]\nconnection = "udpin:127.0.0.1:{second}"\n[gnss.gps1]\nlink = "aux"\nmessage = "GPS2_RAW"\n'
     main, aux = Autopilot(f"udpout:127.0.0.1:{first}"), Autopilot(f"udpout:127.0.0.1:{second}")
     with running(configuration(tmp_path, f"udpin:127.0.0.1:{first}", more)) as run, main.flying(), aux.flying():

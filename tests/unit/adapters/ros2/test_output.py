@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xxhash
 import zenoh
 from numpy.testing import assert_allclose
 
@@ -20,11 +21,13 @@ from fusiond.maths.rotation import matrix
 from fusiond.messages.local_frame import LocalFrame, LocalState
 from fusiond.messages.types import Message, State, StateMessage
 from fusiond.ports.outputs import OutputLost
+from fusiond.units import SECOND
 from fusiond_adapters.ros2 import wire
 from fusiond_adapters.ros2.convert import Converter
-from fusiond_adapters.ros2.output import Ros2Output, topics
+from fusiond_adapters.ros2.output import Ros2Output, make, topics
 from fusiond_adapters.zenoh.session import open_session
-from tests.unit.adapters.ros2.test_wire import DEADLINE, SECOND, T0, definitions, health, told
+from tests.helpers.network import DEADLINE, free_port
+from tests.helpers.ros2 import T0, definitions, health, told
 
 SUBSCRIBER = """
 import atexit, json, os, queue, sys
@@ -68,12 +71,6 @@ for topic, *_ in asked:
     seen = get_topic_info(topic, 42, router_port=port, verbose=True).publishers
     print(json.dumps([[p.node_name, p.node_namespace, p.topic_type, p.type_hash, p.qos] for p in seen]), flush=True)
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def router(port: int) -> zenoh.Session:
@@ -133,7 +130,7 @@ def subscriber(port: int, asked: list[Any]) -> Iterator[Iterator[Any]]:
 
 def test_the_sdk_receives_every_number_in_another_process() -> None:
     pytest.importorskip("zenoh_ros2_sdk", reason="needs zenoh-ros2-sdk")
-    port, name_of = free_port(), {}
+    port, name_of = free_port(socket.SOCK_STREAM), {}
     asked = []
     for name, topic in topics(Ros2(namespace="/rover")):
         name_of[topic.name] = name
@@ -239,7 +236,7 @@ def check_wire(raw: list[Any], want: dict[str, list[bytes]], seen: dict[str, Any
 
 def test_the_gid_is_the_hash_of_the_token() -> None:
     """rmw_zenoh finds the publisher of a message by it."""
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     tokens: list[str] = []
     complete = Event()
 
@@ -257,12 +254,12 @@ def test_the_gid_is_the_hash_of_the_token() -> None:
         assert sorted(token.split("/")[5] for token in tokens) == ["MP"] * 5 + ["NN"]
         assert {token.split("/")[4] for token in tokens} == set("012345")
         gids = {publisher._gid for publisher in running.output._publishers.values()}
-        assert gids == {wire.gid(token) for token in tokens if "/MP/" in token}
+        assert gids == {xxhash.xxh3_128_digest(token.encode())[::-1] for token in tokens if "/MP/" in token}
     assert len(gids) == 5
 
 
 def test_a_router_that_goes_and_comes_back() -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     first = router(port)
     running = Running(port)
     with running:
@@ -279,3 +276,12 @@ def test_a_router_that_goes_and_comes_back() -> None:
             again.put(told(1))
             assert arrived.wait(DEADLINE)
     assert again.output.counts()["sent"] == 4
+
+
+def test_humble_has_no_hashes() -> None:
+    assert {topic.hash for _, topic in topics(Ros2(type_hashes=False))} == {"TypeHashNotSupported"}
+
+
+def test_it_says_where_it_connects() -> None:
+    (output,) = make(Config(ros2=Ros2(enabled=True)), None)  # type: ignore[arg-type]
+    assert output.name == "ros2" and "tcp/127.0.0.1:7447" in output.about

@@ -3,48 +3,29 @@
 import json
 import os
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Any, get_args
+from typing import get_args
 
-import numpy as np
 import pytest
 import zenoh
 
 from fusiond.config.schema import Encoding, Zenoh
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
-from fusiond.messages.types import OutcomeCounts, StateMessage, csv_row, encode, state_message
+from fusiond.messages.codec import encode
+from fusiond.messages.csv import csv_row
 from fusiond_adapters.zenoh.session import (
-    CONTENT_TYPES,
     PublishError,
     ZenohPublisher,
-    alive_key,
     open_session,
     session_config,
     state_key,
 )
+from tests.helpers.estimates import random_messages
+from tests.helpers.network import DEADLINE, free_port, python, read_line
 from tests.helpers.paths import ROOT
 
 DOCS = ROOT / "docs"
-DEADLINE = 15.0  # s
 MESSAGES = 40
-SCALARS = ("latitude", "longitude", "height", "wheel_scale", "sigma_wheel_scale")
-VECTORS = {
-    "velocity_n": 3,
-    "quaternion_nb": 4,
-    "angular_rate_b": 3,
-    "acceleration_b": 3,
-    "gyro_bias": 3,
-    "accel_bias": 3,
-    "mount": 2,
-    "sigma_gyro_bias": 3,
-    "sigma_accel_bias": 3,
-    "sigma_mount": 2,
-}
 
 # Reads without fusiond's code: its own JSON or MessagePack, its own CSV row.
 SUBSCRIBER = """
@@ -73,41 +54,6 @@ with zenoh.open(config) as session, session.declare_subscriber("fusiond/*/state"
 """
 
 
-def messages(count: int) -> list[StateMessage]:
-    """The first is aligning, the rest have random states."""
-    random = np.random.default_rng(11)
-
-    def state() -> StateEstimate:
-        root = random.normal(size=(9, 9))
-        values: dict[str, Any] = {name: random.normal() for name in SCALARS}
-        values |= {name: tuple(random.normal(size=size).tolist()) for name, size in VECTORS.items()}
-        return StateEstimate(covariance=root @ root.T, **values)
-
-    def told(number: int) -> Estimate:
-        t_ns = 1_700_000_000_000_000_001 + number * 20_000_000
-        mode = Mode.NOMINAL if number else Mode.ALIGNING
-        return Estimate(t_ns, mode, 3_000_001, 0, state() if number else None)
-
-    return [state_message(told(number), "rover", OutcomeCounts(fused=number)) for number in range(count)]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-@contextmanager
-def python(code: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """A Python program in another process, ended with the block."""
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def wait_for_reader(publisher: ZenohPublisher) -> None:
     matched = Event()
 
@@ -119,27 +65,22 @@ def wait_for_reader(publisher: ZenohPublisher) -> None:
         assert publisher.matched or matched.wait(DEADLINE), "nobody subscribed"
 
 
-def read_line(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
 @pytest.mark.parametrize("encoding", get_args(Encoding))
 def test_another_process_gets_every_bit(encoding: Encoding) -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
         ZenohPublisher(session, "rover", encoding) as publisher,
         python(SUBSCRIBER, port, MESSAGES) as reader,
     ):
-        assert json.loads(read_line(reader)) == [alive_key("rover")]
+        assert json.loads(read_line(reader)) == ["fusiond/rover/@alive/state"]
         wait_for_reader(publisher)
-        for message in messages(MESSAGES):
+        for message in random_messages(MESSAGES):
             publisher.publish(message)
             key, content_type, priority, express, payload, row = json.loads(read_line(reader))
             assert bytes.fromhex(payload) == encode(message, encoding)
             assert row == csv_row(message)
-            assert (key, content_type) == (state_key("rover"), CONTENT_TYPES[encoding])
+            assert (key, content_type) == ("fusiond/rover/state", f"application/{encoding}")
             assert (priority, express) == (str(zenoh.Priority.REAL_TIME), True)
         assert reader.wait(DEADLINE) == 0
 
@@ -148,8 +89,8 @@ def test_the_documented_subscriber_works() -> None:
     text = (DOCS / "messages.md").read_text(encoding="utf-8")
     code = text.split("```python\n")[2].split("```")[0]
     assert len(code.splitlines()) <= 10
-    port = free_port()
-    message = messages(2)[1]
+    port = free_port(socket.SOCK_STREAM)
+    message = random_messages(2)[1]
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
         ZenohPublisher(session, "rover", "json") as publisher,
@@ -238,7 +179,7 @@ def test_a_bad_endpoint_is_named(endpoint: str) -> None:
 
 def test_a_client_with_nobody_to_connect_to_is_told_so() -> None:
     assert "No peer specified" in complaint(Zenoh(mode="client"))
-    assert "Unable to connect" in complaint(Zenoh(mode="client", connect=[f"tcp/127.0.0.1:{free_port()}"]))
+    assert "Unable to connect" in complaint(Zenoh(mode="client", connect=[f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"]))
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{", b'{"nokey": 1}', b"\xff\xfe"])
@@ -251,17 +192,17 @@ def test_a_bad_config_file_is_named(content: bytes | None, tmp_path: Path) -> No
 def test_publishing_after_the_end_is_an_error_and_closing_twice_is_not() -> None:
     with open_session(Zenoh()) as session:
         with ZenohPublisher(session, "rover", "json") as publisher:
-            publisher.publish(messages(1)[0])
+            publisher.publish(random_messages(1)[0])
             assert not publisher.matched
         publisher.close()
         with pytest.raises(PublishError, match="fusiond/rover/state"):
-            publisher.publish(messages(1)[0])
+            publisher.publish(random_messages(1)[0])
     with pytest.raises(PublishError, match="session closed"):
         ZenohPublisher(session, "rover", "json")
 
 
 def test_the_token_goes_with_the_publisher() -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     come, gone = Event(), Event()
 
     def watch(sample: zenoh.Sample) -> None:

@@ -19,7 +19,9 @@ from fusiond.__main__ import INTERRUPTED, SUCCESS, UNUSABLE, USAGE, main
 from fusiond.app.demo.demo import explanation
 from fusiond.app.replay.summary import Summary
 from fusiond.config.schema import Zenoh
-from fusiond.messages.types import CSV_COLUMNS, StateMessage, csv_header, csv_row, decode
+from fusiond.messages.codec import decode
+from fusiond.messages.csv import CSV_COLUMNS, csv_header, csv_row
+from fusiond.messages.types import StateMessage
 from fusiond_adapters.zenoh.session import open_session, state_key
 
 DRIVE = """
@@ -315,7 +317,7 @@ def test_interrupt_ends_with_a_line(replay: Run, monkeypatch: pytest.MonkeyPatch
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fusiond.app.commands.replay", interrupted)
+    monkeypatch.setattr("fusiond.app.commands.replay.replay", interrupted)
     assert replay() == (INTERRUPTED, "", "fusiond: interrupted\n")
 
 

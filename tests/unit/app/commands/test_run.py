@@ -14,14 +14,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fusiond.messages.types import StateMessage, decode
-from tests.helpers.live import DEADLINE, Autopilot, configuration
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+from fusiond.messages.codec import decode
+from fusiond.messages.types import StateMessage
+from tests.helpers.live import Autopilot, configuration
+from tests.helpers.network import DEADLINE, free_port
 
 
 @pytest.fixture

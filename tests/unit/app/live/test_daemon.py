@@ -22,22 +22,16 @@ from pymavlink.dialects.v20 import common
 from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as config
 from fusiond.config.schema import Config
-from fusiond.estimator.solution import Mode
-from fusiond.messages.types import StateMessage, encode
+from fusiond.messages.codec import encode
+from fusiond.messages.types import StateMessage
 from fusiond_adapters.can.bus import CanBus
 from fusiond_adapters.logs.merge import open_logs
-from tests.helpers.live import DEADLINE, SYSTEM, Autopilot, Running, configuration, parsed, running
+from tests.helpers.live import SYSTEM, Autopilot, Running, aligned, axle, configuration, drive, fused, parsed, running
+from tests.helpers.network import DEADLINE, free_port, udp
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
-Send = Callable[[bytes], object]
 CHANNELS = count()
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture
@@ -49,42 +43,6 @@ def channel() -> str:
 def bus(channel: str) -> Iterator[can.BusABC]:
     with can.Bus(interface="virtual", channel=channel) as opened:
         yield opened
-
-
-def axle(left: int = 0, right: int = 0) -> can.Message:
-    data = left.to_bytes(2, "little") + right.to_bytes(2, "little") + bytes(4)
-    return can.Message(arbitration_id=256, is_extended_id=False, data=data)
-
-
-def drive(run: Running, send: Send, bus: can.BusABC | None, until: Callable[[], bool], autopilot: Autopilot) -> None:
-    """Play an autopilot, and wheels, until something holds: one IMU sample after each publication."""
-    source = run.daemon.inputs["mavlink.fc"]
-    run.until(lambda: source.counts()["sessions"] == 1)
-    for round_ in range(1500):
-        if until():
-            return
-        published = len(run.messages)
-        send(autopilot.imu())
-        if round_ % 20 == 0:
-            send(autopilot.heartbeat() + autopilot.gps())
-        if bus is not None and round_ % 2 == 0:
-            bus.send(axle())
-        run.until(lambda published=published: len(run.messages) > published)
-    raise AssertionError(f"not reached: {run.daemon.status()} {run.daemon.losses()}")
-
-
-def aligned(run: Running) -> bool:
-    return bool(run.messages) and run.messages[-1].mode is Mode.NOMINAL
-
-
-def fused(run: Running, source: str) -> int:
-    return run.daemon.live.engine.fusion.outcomes()[source]["FUSED"]
-
-
-def udp(port: int) -> tuple[socket.socket, Send]:
-    peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    peer.settimeout(DEADLINE)
-    return peer, lambda data: peer.sendto(data, ("127.0.0.1", port))
 
 
 def test_udp_and_can_align_and_publish(tmp_path: Path, channel: str, bus: can.BusABC) -> None:

@@ -47,7 +47,7 @@ class Live:
             self.unfinished = give_way
         return bool(self._frames)
 
-    def finish_tick(self) -> None:
+    def flush(self) -> None:
         self.unfinished = False
 
     def prepare(self) -> None:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 
 import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common
 
 from fusiond.app.live.daemon import Daemon
-from fusiond.app.live.live_engine import MOST_FRAMES, LiveEngine
-from fusiond.messages.types import Message, StateMessage
+from fusiond.app.live.live_engine import MAX_FRAMES, LiveEngine
+from fusiond.app.replay.replay import Replay, Wants
+from fusiond.config.schema import Config
+from fusiond.engine import Engine
+from fusiond.events import Received
+from fusiond.messages import Message, StateMessage
+from fusiond.ports.inputs import Inbox
+from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.play import PlayedClock
+from tests.helpers import drive
 from tests.helpers.live import Autopilot, configuration
 
 BEGIN_NS, MS, STEP_MS = 1_760_000_000_000_000_000, 1_000_000, 3  # samples: between ticks of 10 ms, and now and then at one
@@ -53,10 +62,10 @@ def test_the_state_goes_first_and_what_was_received_after_it_waits(rig: Rig) -> 
     rig.receive(0)  # and so the first tick, at which everything is told
     assert not rig.live.step(rig.inputs, give_way=True)
     assert [type(message) for message in rig.said] == [StateMessage]
-    assert rig.live.unfinished
-    rig.live.finish_tick()
+    assert rig.live.engine.unfinished
+    rig.live.engine.flush()
     assert len(rig.said) > 2
-    assert not rig.live.unfinished
+    assert not rig.live.engine.unfinished
     for number in range(1, 4):  # at 3, 6 and 9 ms
         rig.receive(number)
         assert not rig.live.step(rig.inputs, give_way=True)
@@ -101,7 +110,7 @@ def test_a_tick_that_waited_for_a_sample_gives_way_too(tmp_path: Path) -> None:
     for number in range(4):
         rig.receive(number)
         rig.live.step(rig.inputs, give_way=True)
-    rig.live.finish_tick()
+    rig.live.engine.flush()
     before, taken = len(rig.said), rig.taken()
     for number in (4, 5, 6):
         rig.receive(number)
@@ -133,7 +142,7 @@ def test_giving_way_changes_no_message(tmp_path: Path, on_imu: bool) -> None:
             rig.receive(number)
             while rig.live.step(rig.inputs, give_way=give_way):
                 pass
-        rig.live.finish_tick()
+        rig.live.engine.flush()
         found.append(rig.said)
     assert sum(isinstance(message, StateMessage) for message in found[0]) == SAMPLES * STEP_MS // 10
     assert found[0] == found[1]
@@ -149,12 +158,105 @@ def test_a_stall_is_caught_up_with_every_tick(rig: Rig) -> None:
 
 
 def test_a_flood_is_taken_in_parts(rig: Rig) -> None:
-    for number in range(2 * MOST_FRAMES + 10):
+    for number in range(2 * MAX_FRAMES + 10):
         rig.receive(number)
     for part in range(1, 3):
         assert rig.live.step(rig.inputs)
-        assert rig.taken() == part * MOST_FRAMES
+        assert rig.taken() == part * MAX_FRAMES
     assert not rig.live.step(rig.inputs)
-    assert rig.taken() == 2 * MOST_FRAMES + 10
+    assert rig.taken() == 2 * MAX_FRAMES + 10
     ticks = {message.t_ns for message in rig.said if isinstance(message, StateMessage)}
-    assert len(ticks) == -(-(2 * MOST_FRAMES + 10) * STEP_MS // 10)
+    assert len(ticks) == -(-(2 * MAX_FRAMES + 10) * STEP_MS // 10)
+
+
+# --- Live and replay
+
+
+class Played:
+    """An input whose frames are events already."""
+
+    name = file = "played"
+
+    def __init__(self) -> None:
+        self.inbox: Inbox[Received] = Inbox(10**6, lambda: None, lambda event: event.source)
+
+    def decode(self, item: Received, t_ns: int) -> list[Received]:
+        return [replace(item, t_receive_ns=t_ns)]
+
+    def record(self, item: Received, t_ns: int) -> bytes:
+        return b""
+
+
+def recorded(setup: Config) -> list[Received]:
+    """The drive as a black box has it: receipts ascend by a microsecond at the least."""
+    found: list[Received] = []
+    last_ns = 0
+    for event in open_logs([str(drive.folder() / log) for log in drive.LOGS], setup):
+        last_ns = max(last_ns + 1000, event.t_receive_ns // 1000 * 1000)
+        found.append(replace(event, t_receive_ns=last_ns))
+    return found
+
+
+def live_messages(setup: Config, events: list[Received], *, give_way: bool, batch: int) -> list[Message]:
+    clock, source, said = PlayedClock(events[0].t_receive_ns, 1.0), Played(), list[Message]()
+    live = LiveEngine(setup, clock.now_ns, said.append)
+    for at in range(0, len(events), batch):
+        for event in events[at : at + batch]:
+            source.inbox.put(event.t_receive_ns, event)
+        clock.set(events[min(at + batch, len(events)) - 1].t_receive_ns)
+        while live.step({"played": source}, give_way=give_way):
+            pass
+    live.engine.flush()
+    return said
+
+
+def replayed_messages(setup: Config, events: list[Received]) -> list[Message]:
+    said: list[Message] = []
+    Replay(setup, Wants(setup.publish.rate_hz, on_message=[said.append])).run(events)
+    return said
+
+
+@pytest.mark.parametrize("on_imu", [False, True])
+@pytest.mark.parametrize(("give_way", "batch"), [(False, 1), (True, 1), (True, 7)])
+def test_live_and_replay_make_the_same_messages(on_imu: bool, give_way: bool, batch: int) -> None:
+    """Of all kinds, whole: there is no shell around either."""
+    setup = drive.settings()
+    setup = replace(setup, publish=replace(setup.publish, on_imu=on_imu))
+    events = recorded(setup)
+    live = live_messages(setup, events, give_way=give_way, batch=batch)
+    assert live == replayed_messages(setup, events)
+    assert len({type(message) for message in live}) == 5
+
+
+def test_live_and_replay_call_the_same_functions_from_feed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For each event, in order, down to the history, which catches up after each frame of a live run, and later in a
+    replay."""
+    compared = ("fusiond.engine", "fusiond.timeline", "fusiond.messages", "fusiond.estimator.fusion")
+    setup = drive.settings()
+    events = recorded(setup)[:600]
+    feed = Engine.feed
+    calls: list[list[str]] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        module = frame.f_globals.get("__name__", "")
+        if event == "call" and module.startswith(compared):
+            calls[-1].append(f"{module}.{frame.f_code.co_qualname}")
+
+    def profiled(engine: Engine, event: Received) -> object:
+        calls.append([])
+        sys.setprofile(note)
+        try:
+            return feed(engine, event)
+        finally:
+            sys.setprofile(None)
+
+    found = []
+    monkeypatch.setattr(Engine, "feed", profiled)
+    for run in (lambda: live_messages(setup, events, give_way=False, batch=600), lambda: replayed_messages(setup, events)):
+        run()
+        found.append(list(calls))
+        calls.clear()
+    live, replayed = found
+    assert len(live) == len(events)
+    assert live == replayed
+    assert {"fusiond.estimator.fusion.Fusion.receive", "fusiond.messages.schedule.Publication.add"} <= set(live[-1])

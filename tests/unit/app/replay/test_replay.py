@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
-from fusiond.app.progress import line, shown
 from fusiond.app.replay.comparison import Errors, Truth, TruthRow, Window
-from fusiond.app.replay.replay import Pacer, Replay, Wants, Withheld, parse_interval, parse_withheld
+from fusiond.app.replay.intervals import Withheld, parse_withheld
+from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
-from fusiond.errors import UsageError
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import GnssPosition, ImuSample, Invalid, Received, WheelSpeed
-from fusiond.messages.types import OutcomeCounts, StateMessage, csv_row, state_message
+from fusiond.messages import Message, OutcomeCounts, StateMessage, csv_row, state_message
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
@@ -116,16 +114,20 @@ def test_a_tick_waits_for_an_inertial_sample_for_half_a_period(setup: Config) ->
     assert [t / MS for t in instants] == [0, 130, 250, 300, 449]
 
 
-def test_another_sensor_does_not_end_the_wait(setup: Config) -> None:
+def test_another_sensor_does_not_end_the_wait(setup: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     waiting = replace(setup, publish=replace(setup.publish, on_imu=True))
     other = Received("imu1", 0, "", None, T0 + 110 * MS, ImuSample((0.0, 0.0, -9.8), (0.0, 0.0, 0.0)))
     order: list[tuple[int, int]] = []
-    engine = Engine(waiting, 10.0, lambda since, _: order.append((since, engine.now_ns - T0)))
+
+    def note(message: Message) -> None:
+        assert isinstance(message, StateMessage)
+        order.append((message.t_ns - T0, engine.now_ns - T0))
+
+    engine = Engine(waiting, note, rate_hz=10.0, only_states=True)
+    known = engine.fusion.receive(imu(T0))
+    monkeypatch.setattr(engine.fusion, "receive", lambda _: known)  # the other is not of this configuration
     for event in (imu(T0), other, imu(T0 + 120 * MS, 1)):
-        engine.advance(event.t_receive_ns)
-        if event is not other:  # which this configuration does not know
-            engine.take(event)
-        engine.taken(event)
+        engine.feed(event)
     assert order == [(0, 0), (120 * MS, 120 * MS)]
 
 
@@ -200,21 +202,6 @@ def test_pace_is_asked_before_every_event_and_tick(setup: Config) -> None:
     assert asked == [0, 0, 100 * MS, 200 * MS, 250 * MS]
 
 
-def test_pacer_sleeps_only_when_ahead() -> None:
-    now, slept = [0], []
-
-    def sleep(seconds: float) -> None:
-        slept.append(seconds)
-        now[0] += round(seconds * SECOND)
-
-    pace = Pacer(2.0, lambda: now[0], sleep)
-    pace(0)
-    pace(4 * SECOND)  # due after 2 s
-    now[0] += 5 * SECOND  # the work took longer than the drive
-    pace(6 * SECOND)
-    assert slept == [2.0]
-
-
 # --- Withholding
 
 
@@ -239,29 +226,6 @@ def test_the_ends_of_a_withheld_interval(setup: Config) -> None:
     wants = Wants(RATE, [parse_withheld("imu0:0.1-0.2", setup)], on_receipt=[seen.append])
     Replay(setup, wants).run([imu(T0 + t * MS, t) for t in (0, 99, 100, 199, 200)])
     assert [receipt.measurement.sequence for receipt in seen] == [0, 99, 200]
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("gps9:1-2", "there is no source 'gps9'; configured: gps0, front_left"),
-        ("gps0", "give SOURCE:START-STOP"),
-        ("gps0:", "is no interval"),
-        ("gps0:5-5", "is no interval"),
-        ("gps0:9-5", "is no interval"),
-        ("gps0:-1-5", "is no interval"),
-        (":1-2", "there is no source ''"),
-    ],
-)
-def test_what_cannot_be_withheld(setup: Config, text: str, complaint: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        parse_withheld(text, setup)
-    assert complaint in str(caught.value)
-
-
-def test_one_stream_of_a_receiver_can_be_withheld(setup: Config) -> None:
-    assert parse_withheld("gps0.velocity:0-1.5", setup).sources == {"gps0.velocity"}
-    assert parse_interval("12.5-22") == (12.5, 22.0)
 
 
 # --- Summary
@@ -297,51 +261,3 @@ def test_window_limits_the_comparison(setup: Config, events: list[Received]) -> 
     found = replay.summary("c.toml", {}, []).truth
     assert found is not None
     assert (found.rows, found.start_s, found.stop_s) == (21, 3.0, 5.0)
-
-
-# --- Progress
-
-
-class Terminal:
-    """A text stream that says whether it is a terminal, and keeps what is written."""
-
-    def __init__(self, tty: bool) -> None:
-        self.tty = tty
-        self.text = ""
-
-    def isatty(self) -> bool:
-        return self.tty
-
-    def write(self, text: str) -> int:
-        self.text += text
-        return len(text)
-
-    def flush(self) -> None:
-        self.text += ""
-
-
-def test_progress_is_shown_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter(range(0, 10**15, SECOND))
-    monkeypatch.setattr("fusiond.app.progress.time.monotonic_ns", lambda: next(clock))
-    for tty in (True, False):
-        stream = Terminal(tty)
-        items = list(shown(range(200), lambda: 0.5, lambda: 3 * SECOND, stream))  # type: ignore[arg-type]
-        assert items == list(range(200))
-        assert ("50 %  3 s of drive" in stream.text) is tty
-    assert Terminal(False).text == ""
-
-
-def test_progress_line_stays_within_its_bounds() -> None:
-    assert "100 %" in line(1.7, 10.0, 2.0)
-    assert line(0.0, 0.0, 0.0).startswith("[..")
-
-
-def test_progress_ends_its_line_when_the_work_breaks_off() -> None:
-    def broken() -> Iterator[int]:
-        yield 1
-        raise OSError("gone")
-
-    stream = Terminal(True)
-    with pytest.raises(OSError, match="gone"):
-        list(shown(broken(), lambda: 0.0, lambda: 0, stream))  # type: ignore[arg-type]
-    assert stream.text.endswith("\x1b[K")

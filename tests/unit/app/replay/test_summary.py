@@ -22,7 +22,8 @@ from fusiond.app.replay.comparison import (
     parse_truth,
 )
 from fusiond.estimator.solution import Estimate, Mode, StateEstimate
-from fusiond.messages.types import OutcomeCounts, StateMessage, state_message
+from fusiond.messages.from_solution import state_message
+from fusiond.messages.types import OutcomeCounts, StateMessage
 
 SECOND = 10**9
 HEADER = "unix_us,lat_deg,lon_deg,height_m,vn_mps,ve_mps,vd_mps,roll_deg,pitch_deg,yaw_deg"

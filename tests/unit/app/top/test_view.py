@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import select
+import socket
 import subprocess
 import sys
 import time
@@ -24,7 +25,7 @@ from fusiond.estimator.solution import Mode
 from fusiond.messages.types import EventMessage, HealthMessage, Message, OutputHealth, StateMessage
 from fusiond_adapters.zenoh.session import ZenohPublisher, open_session
 from tests.helpers.drive import messages, settings
-from tests.unit.adapters.zenoh.test_session import DEADLINE, free_port
+from tests.helpers.network import DEADLINE, free_port
 
 CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -129,7 +130,7 @@ def published(vehicle: str = "tested") -> Iterator[int]:
     """A vehicle that is dead reckoning, told again and again over Zenoh; its port."""
     told = until(Mode.DEAD_RECKONING)
     again = [message for message in told if isinstance(message, StateMessage)][-1], told[-1]
-    port, stop = free_port(), Event()
+    port, stop = free_port(socket.SOCK_STREAM), Event()
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
         ZenohPublisher(session, vehicle, "json") as publisher,
@@ -158,16 +159,16 @@ def test_once_prints_a_screen(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", "--connect", f"tcp/127.0.0.1:{free_port()}", "--once"]) == UNUSABLE
+    assert main(["top", "--connect", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", "--once"]) == UNUSABLE
     assert "Unable to connect" in capsys.readouterr().err
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     with open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])):
         assert main(["top", "--connect", f"tcp/127.0.0.1:{port}"]) == UNUSABLE
     assert "no fusiond is running there" in capsys.readouterr().err
 
 
 def test_several_vehicles_have_to_be_chosen_from(capsys: pytest.CaptureFixture[str]) -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
         ZenohPublisher(session, "one", "json"),

@@ -1,0 +1,87 @@
+"""fusiond replay: recorded logs, fused."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+from fusiond.app.commands import EXIT_CODES
+from fusiond.app.commands.argument_types import positive, rate
+from fusiond.app.replay.comparison import Window
+from fusiond.app.replay.intervals import parse_interval, parse_withheld
+from fusiond.app.replay.job import Options, replay
+from fusiond.app.replay.summary import text
+from fusiond.config import load as config
+from fusiond.errors import UsageError
+from fusiond_adapters.host import journal
+
+ABOUT = """\
+Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
+belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
+EXAMPLES = """\
+examples:
+  fusiond replay --config car.toml drive.tlog drive.log --csv track.csv
+      fuse a MAVLink log and a candump log into a track
+  fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --window 10-30 --plot errors.png
+      compare seconds 10 to 30 with a reference, and draw the errors
+  fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --withhold gps0:12-22 --window 12-22
+      how far off is it after ten seconds without GNSS?
+  fusiond replay --config car.toml drive.tlog drive.log --speed 1 --publish
+      publish over Zenoh all that `fusiond run` would, in real time: open `fusiond top` beside it
+  fusiond replay --config car.toml drive.tlog drive.log --speed 1 --outputs
+      rehearse everything that the configuration turns on: ROS 2, Foxglove, Prometheus, ...
+"""
+
+
+def fill(parser: argparse.ArgumentParser) -> None:
+    """The grammar."""
+    parser.description, parser.epilog = ABOUT, f"{EXAMPLES}\n{EXIT_CODES}"
+    add = parser.add_argument
+    add("logs", metavar="LOG", nargs="+", help=".tlog, .log (candump -L), .asc, .blf, .trc, ..., also .gz; or NAME=LOG")
+    add("--config", metavar="C.toml", required=True, help="configuration of the vehicle (see `fusiond check`)")
+    add("--csv", metavar="OUT.csv", type=Path, help="write the track: one row per publication")
+    add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
+    add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
+    add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
+    add("--stored", metavar="STATE.json", type=Path, help="begin with the stored state that the recorded run began with")
+    add("--mcap", metavar="OUT.mcap", type=Path, help="write everything published, for Foxglove (extra `mcap`)")
+    add("--plot", metavar="OUT.png", type=Path, help="draw the track and, with --truth, its errors (extra `plot`)")
+    add(
+        "--withhold",
+        metavar="SOURCE:START-STOP",
+        action="append",
+        default=[],
+        help="keep a source out between these seconds from the first event, such as gps0:12-22; may be repeated",
+    )
+    add("--rate", metavar="HZ", type=rate, help="publications per second; default: publish.rate_hz of the config")
+    add("--speed", metavar="X", type=positive, help="replay at X times real time; default: as fast as possible")
+    add("--publish", action="store_true", help="publish over Zenoh, as configured, all that `fusiond run` publishes")
+    add("--outputs", action="store_true", help="feed every output that the configuration turns on, Zenoh among them")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """The action."""
+    loaded = config.load(arguments.config)
+    if arguments.window and not arguments.truth:
+        raise UsageError("--window limits the comparison with a truth: give --truth as well")
+    if arguments.publish or arguments.outputs:
+        journal.set_up(logging.WARNING)  # says when an output is lost
+    options = Options(
+        config=loaded,
+        config_name=Path(arguments.config).name,
+        logs=arguments.logs,
+        csv=arguments.csv,
+        json=arguments.json,
+        truth=arguments.truth,
+        plot=arguments.plot,
+        mcap=arguments.mcap,
+        stored=arguments.stored,
+        withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
+        window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
+        rate_hz=arguments.rate,
+        speed=arguments.speed,
+        publish=arguments.publish,
+        outputs=arguments.outputs,
+    )
+    print(text(replay(options)))

@@ -1,0 +1,94 @@
+"""The inputs of the daemon: each is prepared, opened and read in a thread of its own, and opened again when it is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from threading import Event, Thread
+from typing import Any
+
+from fusiond.app.supervisor import keep_open
+from fusiond.config.schema import Config, sensor_tables
+from fusiond.messages import InputHealth
+from fusiond.ports.inputs import LiveInput
+
+
+class Inputs(Mapping[str, LiveInput[Any]]):
+    """The inputs of one run, by kind and name. `max_pause_s` limits the pauses before one that was lost is opened again;
+    `on_fault` is called, in its thread, when one cannot be prepared: see `fault`."""
+
+    def __init__(
+        self, inputs: Mapping[str, LiveInput[Any]], max_pause_s: Callable[[], float], on_fault: Callable[[], None]
+    ) -> None:
+        self.fault: BaseException | None = None  # what went wrong when one was prepared, such as a ConfigError
+        self._inputs, self._max_pause_s, self._on_fault = dict(inputs), max_pause_s, on_fault
+        self._over = Event()
+        self._stops = {key: Event() for key in self._inputs}  # ends the present session of an input
+        self._prepared = {key: Event() for key in self._inputs}
+        self._threads = [Thread(target=self._keep, args=(key,), name=key) for key in self._inputs]
+
+    def __getitem__(self, key: str) -> LiveInput[Any]:
+        return self._inputs[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._inputs)
+
+    def __len__(self) -> int:
+        return len(self._inputs)
+
+    # --- Their sessions
+
+    def start(self) -> None:
+        """Prepare and open all of them, each in a thread of its own."""
+        for thread in self._threads:
+            thread.start()
+
+    def wait_until_prepared(self) -> None:
+        """Wait until each is prepared, or could not be."""
+        for event in self._prepared.values():
+            event.wait()
+
+    def stop(self) -> None:
+        """Close all of them. From any thread."""
+        self._over.set()
+        for event in self._stops.values():
+            event.set()
+
+    def join(self) -> None:
+        """Wait for their end, after `stop`."""
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
+
+    def configure(self, config: Config, keys: Sequence[str]) -> None:
+        """Take from a configuration what changed of it, by key, and open anew what that concerns. Raises ConfigError."""
+        rates = any(key.partition(".")[0] in sensor_tables() for key in keys)
+        for name, source in self._inputs.items():
+            if any(key.startswith(f"{name}.") for key in keys) or (rates and name.startswith("mavlink.")):
+                source.configure(config)
+                self._stops[name].set()
+
+    def _keep(self, key: str) -> None:
+        source = self._inputs[key]
+
+        def session() -> None:
+            stop = self._stops[key] = Event()
+            if not self._over.is_set():  # it may have been set before there was this event
+                source.session(stop)
+
+        try:
+            source.prepare()
+        except Exception as fault:  # of the configuration, or a driver's: the daemon ends, and raises it
+            self.fault = fault
+            self._on_fault()
+        finally:
+            self._prepared[key].set()
+        keep_open(source, session, self._over, self._max_pause_s)
+
+    # --- What became of the frames
+
+    def health(self) -> dict[str, InputHealth]:
+        """As it is published."""
+        return {
+            key: InputHealth(received=source.inbox.received, dropped=source.inbox.dropped, counts=source.counts())
+            for key, source in self._inputs.items()
+        }

@@ -1,0 +1,98 @@
+"""Outputs attached to a replay: those of a live run, so that a dashboard or a ROS node can be rehearsed with a log.
+
+They are the very same, but a replay waits for them: where an outbox is full it stands still until there is room, up to
+PATIENCE_S, so that nothing is lost however fast it goes. What is lost after that is counted, and told at the end.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from msgspec.structs import replace
+
+from fusiond.app.outputs import Outputs
+from fusiond.app.replay.pacer import Pacer, ReplayClock
+from fusiond.config.schema import Config
+from fusiond.engine import Engine
+from fusiond.errors import OutputError
+from fusiond.messages import LatencyHealth, Message
+from fusiond.messages.info import config_message, info_message
+from fusiond.messages.schedule import Surroundings
+from fusiond.ports.outputs import Around, LiveOutput
+from fusiond_adapters.registry import make_outputs
+from fusiond_adapters.zenoh.output import ZenohOutput
+
+PATIENCE_S = 10.0  # for an output that takes nothing
+
+log = logging.getLogger("fusiond")
+
+
+def attachable(config: Config) -> tuple[Config, list[str]]:
+    """The configuration without the outputs that need a live link, and why each of these cannot be attached."""
+    refused = []
+    for name in ("autopilot", "ground_station"):
+        section = getattr(config, name)
+        if section.link is not None:
+            refused.append(f"[{name}] is not attached: it sends over [mavlink.{section.link}], which a replay does not open")
+            config = replace(config, **{name: replace(section, link=None)})
+    return config, refused
+
+
+class Attached:
+    """The outputs of one replay: Zenoh, or with `everything` all that the configuration turns on. Raises ConfigError where
+    one lacks its extra."""
+
+    def __init__(self, config: Config, pacer: Pacer | None, *, everything: bool) -> None:
+        self.warnings: list[str] = []
+        self._config, self._paced = config, pacer is not None
+        self._engine: Engine | None = None
+        clock = ReplayClock(lambda: self._running.first_ns or 0, lambda: self._running.now_ns, pacer)
+        made: list[LiveOutput]
+        if everything:
+            config, self.warnings = attachable(config)
+            made = list(make_outputs(config, Around(clock, {})).values())
+        else:
+            made = [ZenohOutput(config)]
+        self.outputs = Outputs(made, clock.now_ns, self._introduction, self._max_pause_s, PATIENCE_S)
+
+    @property
+    def _running(self) -> Engine:
+        assert self._engine is not None
+        return self._engine
+
+    def put(self, message: Message) -> None:
+        """Leave a message with every output: an engine's sink."""
+        self.outputs.put(message)
+
+    def surroundings(self) -> Surroundings:
+        """What the health says of the outputs; latencies where there is a pace to keep."""
+        latency = LatencyHealth(published=self.outputs.handed_over.report() if self._paced else None)
+        return Surroundings(latency, {}, self.outputs.health())
+
+    @contextmanager
+    def opened(self, engine: Engine) -> Iterator[None]:
+        """All of them are open inside the block, and have sent what they had at its end. Raises OutputError."""
+        self._engine = engine
+        for warning in self.warnings:
+            log.warning("%s", warning)
+        try:
+            self.outputs.start()
+            self.outputs.wait_until_tried()
+            if self.outputs.failures:
+                raise OutputError("; ".join(self.outputs.failures.values()))
+            yield
+        finally:
+            self.outputs.stop()
+            self.outputs.join()
+        for name, count in self.outputs.unsent().items():
+            if count:
+                why = self.outputs.failures.get(name, f"it took nothing for {PATIENCE_S:g} s")
+                self.warnings.append(f"{name}: {count} messages were lost: {why}")
+
+    def _introduction(self) -> list[Message]:
+        return [info_message(self._config, self._running.fusion), config_message(self._config)]
+
+    def _max_pause_s(self) -> float:
+        return self._config.live.reopen_max_s

@@ -1,0 +1,125 @@
+"""The files around a replay: what it reads besides the logs, and what every message is written to."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from fusiond.app.replay.comparison import Errors, Truth, TruthError, TruthRow, parse_truth
+from fusiond.app.state_file import read_state
+from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
+from fusiond.errors import OutputError, UsageError
+from fusiond.filter.stored_state import StoredState, StoredStateError, check
+from fusiond.messages import Message, StateMessage, csv_header, csv_row
+from fusiond_adapters.logs.file import LogError
+
+# --- Read
+
+
+def stored_state(path: Path, config: Config) -> StoredState:
+    """The stored state that a recording began with. Raises LogError."""
+    try:
+        stored = read_state(path)
+        if stored is None:
+            raise StoredStateError("there is no such file")
+        check(stored, config)
+    except StoredStateError as error:
+        raise LogError(f"{path}: {error}") from error
+    return stored
+
+
+def truth_of(path: Path) -> Truth:
+    """A reference track, after a first pass in which every fault would show. Raises TruthError."""
+    for _ in _read_truth(path):
+        pass
+    return Truth(_read_truth(path))
+
+
+def _read_truth(path: Path) -> Iterator[TruthRow]:
+    opener = gzip.open if path.suffix.lower() == ".gz" else open
+    try:
+        with opener(path, "rt", encoding="utf-8") as file:
+            yield from parse_truth(file, str(path))
+    except UnicodeDecodeError as error:
+        raise TruthError(f"{path}: is not UTF-8 text") from error
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise TruthError(f"{path}: is no sound gzip file: {error}") from error
+    except OSError as error:
+        raise TruthError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+# --- Written
+
+
+@contextmanager
+def delivering(path: Path) -> Iterator[None]:
+    """Inside the block an OSError is told as an OutputError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Whether files can be written, found before the work begins. Raises UsageError, OutputError."""
+    read = {path.resolve() for path in inputs}
+    for path in outputs:
+        if path.resolve() in read:
+            raise UsageError(f"{path}: is an input, and would be overwritten")
+        if not path.parent.is_dir():
+            raise OutputError(f"{path}: cannot be written: there is no folder {path.parent}")
+
+
+def csv_file(path: Path, stack: ExitStack) -> Callable[[StateMessage, Errors | None], None]:
+    """Opens a track for as long as the stack; returns what writes a row of it. Raises OutputError."""
+    with delivering(path):
+        file = stack.enter_context(path.open("w", encoding="ascii", newline="\n"))
+        file.write(csv_header() + "\n")
+
+    def write_row(state: StateMessage, _: Errors | None) -> None:
+        file.write(csv_row(state) + "\n")
+
+    return write_row
+
+
+def mcap_file(path: Path, config: Config, stack: ExitStack) -> Callable[[Message], None]:
+    """Opens an MCAP file for as long as the stack; returns what writes a message. Raises UsageError, OutputError."""
+    try:
+        from fusiond_adapters.foxglove.converter import Converter  # noqa: PLC0415 - needs the extra `mcap`
+        from fusiond_adapters.mcap import McapFile  # noqa: PLC0415
+    except ConfigError as error:
+        raise UsageError(f"--mcap: {error}") from error
+
+    with delivering(path):
+        file = stack.enter_context(McapFile(path, config))
+    converter = Converter()
+
+    def write(message: Message) -> None:
+        for record in converter.records(message):
+            file.add(record)
+
+    return write
+
+
+# --- Names
+
+
+def short_names(paths: Iterable[str]) -> dict[str, str]:
+    """File names that stand for paths in the summary; alike ones are numbered."""
+    names: dict[str, str] = {}
+    for path in paths:
+        name = Path(path).name
+        alike = sum(Path(other).name == name for other in names)
+        names[path] = f"{name} ({alike + 1})" if alike else name
+    return names
+
+
+def with_short_names(text: str, names: dict[str, str]) -> str:
+    """A text with the names in place of the paths."""
+    for path, name in names.items():
+        text = text.replace(path, name)
+    return text

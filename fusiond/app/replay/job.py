@@ -1,0 +1,128 @@
+"""One `fusiond replay`: the logs and files that it reads, the files and outputs that it feeds, around a replay."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from fusiond.app.progress import shown
+from fusiond.app.replay.comparison import Window
+from fusiond.app.replay.files import (
+    check_outputs,
+    csv_file,
+    delivering,
+    mcap_file,
+    short_names,
+    stored_state,
+    truth_of,
+    with_short_names,
+)
+from fusiond.app.replay.intervals import Withheld
+from fusiond.app.replay.pacer import Pacer
+from fusiond.app.replay.replay import WHOLE, Replay, Wants
+from fusiond.app.replay.summary import Summary, to_json
+from fusiond.app.replay.trace import Trace
+from fusiond.config.schema import Config
+from fusiond.errors import UsageError
+from fusiond.filter.hot_start import WORDS
+from fusiond.filter.state import Verdict
+from fusiond_adapters.logs.file import LogError
+from fusiond_adapters.logs.merge import LogSet, open_logs
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of one replay."""
+
+    config: Config
+    config_name: str
+    logs: Sequence[str]
+    csv: Path | None = None
+    json: Path | None = None
+    truth: Path | None = None
+    plot: Path | None = None
+    mcap: Path | None = None
+    stored: Path | None = None
+    withheld: Sequence[Withheld] = ()
+    window: Window = WHOLE
+    rate_hz: float | None = None  # default: the configuration's
+    speed: float | None = None  # default: as fast as possible
+    publish: bool = False  # over Zenoh
+    outputs: bool = False  # over everything that the configuration turns on
+    share: Callable[[int], float] | None = None  # part done by the time passed [ns], for the bar; default: bytes read
+
+
+def replay(options: Options) -> Summary:
+    """Replay logs as asked for, and write what was asked for.
+
+    Raises ConfigError, LogError, TruthError, UsageError, OutputError.
+    """
+    config, logs = options.config, open_logs(options.logs, options.config)
+    pacer = Pacer(options.speed) if options.speed else None
+    wants = Wants(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)
+    wants.stored = stored_state(options.stored, config) if options.stored else None
+    wants.truth = truth_of(options.truth) if options.truth else None
+    trace = Trace() if options.plot else None
+    if trace:
+        wants.on_tick.append(trace.add_tick)
+        wants.on_receipt.append(trace.add_receipt)
+    attached_warnings: list[str] = []
+    with ExitStack() as stack:
+        _open_files(options, wants, stack)
+        if options.publish or options.outputs:
+            from fusiond.app.replay.attached import Attached  # noqa: PLC0415 - Zenoh is slow to import
+
+            attached = Attached(config, pacer, everything=options.outputs)
+            attached_warnings = attached.warnings
+            wants.on_message.append(attached.put)
+            wants.surroundings = attached.surroundings
+            run = Replay(config, wants)
+            stack.enter_context(attached.opened(run.engine))
+        else:
+            run = Replay(config, wants)
+        share = options.share or (lambda _: logs.bytes_read / logs.bytes_total)
+        run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr))
+    summary = _summary(options, run, logs, attached_warnings)
+    if options.json:
+        with delivering(options.json):
+            options.json.write_bytes(to_json(summary))
+    if trace and options.plot:
+        from fusiond.app.replay.picture import draw  # noqa: PLC0415 - needs the extra `plot`, slow to import
+
+        trace.read_outcomes()
+        with delivering(options.plot):
+            draw(trace, summary, options.plot)
+    return summary
+
+
+def _open_files(options: Options, wants: Wants, stack: ExitStack) -> None:
+    """Open what every tick goes to; what cannot be written is found before the work begins."""
+    written = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
+    read = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
+    check_outputs(written, read)
+    if options.plot and importlib.util.find_spec("matplotlib") is None:
+        raise UsageError("--plot needs the extra plot: pip install 'fusiond[plot]'")
+    if options.csv:
+        wants.on_tick.append(csv_file(options.csv, stack))
+    if options.mcap:
+        wants.on_message.append(mcap_file(options.mcap, options.config, stack))
+
+
+def _summary(options: Options, run: Replay, logs: LogSet, attached_warnings: Sequence[str]) -> Summary:
+    """What came out. Raises LogError where nothing went in."""
+    names = short_names(logs.counts)
+    if run.first_ns is None:
+        met = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())
+        raise LogError(f"nothing in the logs that the configuration asks for ({met})")
+    warnings = [with_short_names(warning, names) for warning in logs.warnings]
+    summary = run.summary(options.config_name, {names[path]: counts for path, counts in logs.counts.items()}, warnings)
+    if options.stored and (verdict := run.fusion.hot_start()) is not Verdict.BELIEVED:
+        warnings.append(f"stored state: {WORDS[verdict]}")
+    if options.truth and summary.truth is None:
+        warnings.append(f"{options.truth.name}: no published state to compare with it; is it of this drive?")
+    warnings += attached_warnings
+    return summary

@@ -1,0 +1,50 @@
+"""How fast a replay goes, and the clock that its outputs read."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from fusiond_adapters.host.clock import HostClock
+
+
+class Pacer:
+    """Sleeps so that recorded time passes `speed` times as fast as real time. It starts with its first call."""
+
+    def __init__(
+        self, speed: float, clock: Callable[[], int] = time.monotonic_ns, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self._speed, self._clock, self._sleep = speed, clock, sleep
+        self._start_ns: int | None = None
+
+    def __call__(self, since_start_ns: int) -> None:
+        """Sleep until so much of the drive should have passed."""
+        if self._start_ns is None:
+            self._start_ns = self._clock()
+        ahead_ns = self._start_ns + since_start_ns / self._speed - self._clock()
+        if ahead_ns > 0:
+            self._sleep(ahead_ns / 1e9)
+
+    @property
+    def elapsed_ns(self) -> int:
+        """How much of the drive should have passed by now."""
+        return 0 if self._start_ns is None else round((self._clock() - self._start_ns) * self._speed)
+
+
+class ReplayClock(HostClock):
+    """The time line of a drive that is replayed: how far it should have come by its pacer, or else how far it has come.
+
+    `first_ns` and `now_ns` tell the receipts of the first and of the latest event.
+    """
+
+    def __init__(self, first_ns: Callable[[], int], now_ns: Callable[[], int], pacer: Pacer | None) -> None:
+        super().__init__()
+        self._first_ns, self._reached_ns, self._pacer = first_ns, now_ns, pacer
+
+    def now_ns(self) -> int:
+        """The present instant of the drive."""
+        return self._reached_ns() if self._pacer is None else self._first_ns() + self._pacer.elapsed_ns
+
+    def from_wall_ns(self, wall_ns: int) -> int:
+        """The present instant: stamps of the wall clock mean nothing here."""
+        return self.now_ns()

@@ -1,0 +1,36 @@
+"""The commands: each a module, found by its name; only the one that is called is imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+
+from fusiond.app.commands import COMMANDS
+
+HEAVY = (
+    "fusiond.app.replay", "fusiond.app.demo", "fusiond.app.top", "fusiond.simulation", "zenoh", "can", "cantools", "numpy",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_has_a_grammar_and_an_action(name: str) -> None:
+    module = import_module(f"fusiond.app.commands.{name}")
+    assert callable(module.fill) and callable(module.run)
+    assert module.__doc__ and module.__doc__.startswith(f"fusiond {name}: ")
+
+
+def test_the_daemon_pays_for_no_other_command() -> None:
+    """Its grammar imports next to nothing; all of the daemon no module of another command."""
+    code = (
+        "import sys, fusiond.__main__ as m; m.parser('run'); print(*sys.modules)\n"
+        "import fusiond.app.live.serve; print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    grammar, daemon = (line.split() for line in done.stdout.splitlines())
+    assert not [module for module in grammar if module.startswith(HEAVY)]
+    own = HEAVY[:4]
+    assert not [module for module in daemon if module.startswith(own)]
+    assert {module for module in daemon if module.startswith("fusiond.app.commands.")} == {"fusiond.app.commands.run"}

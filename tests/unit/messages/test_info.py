@@ -1,0 +1,25 @@
+"""What is running, as a message: versions, keys, sources and the configuration in force."""
+
+from __future__ import annotations
+
+from fusiond.estimator.fusion import Fusion
+from fusiond.messages.info import config_message, info_message
+from tests.helpers.streams import config
+
+
+def test_information_names_keys_and_kinds_of_sources() -> None:
+    settings = config(["left"])
+    told = info_message(settings, Fusion(settings))
+    name = settings.vehicle.name
+    assert told.keys["state"] == f"fusiond/{name}/state"
+    assert told.keys["innovations"] == f"fusiond/{name}/innovations/*"
+    assert told.sources == {
+        "imu0": "imu", "gps0.position": "gnss_position", "gps0.velocity": "gnss_velocity", "left": "wheel_speed"
+    }  # fmt: skip
+
+
+def test_the_configuration_is_plain_values_with_defaults_and_without_its_folder() -> None:
+    told = config_message(config(["left"])).config
+    assert told["wheel"]["left"]["bus"] == "bus"
+    assert told["filter"]["horizon_s"] > 0
+    assert "directory" not in told

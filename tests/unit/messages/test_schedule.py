@@ -1,0 +1,73 @@
+"""What is published at ticks besides the state: resets with their reasons, holes, the health when something changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fusiond.config.schema import Config
+from fusiond.engine import SECOND, Engine
+from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Received
+from fusiond.messages import EventMessage, HealthMessage, InnovationMessage, Message
+from tests.helpers.live import configuration
+
+
+class Player:
+    """An engine, played by hand."""
+
+    def __init__(self, settings: Config) -> None:
+        self.told: list[Message] = []
+        self._engine = Engine(settings, self.told.append, rate_hz=10.0)
+
+    def play(self, seconds: float, begin_s: float = 0.0, metres_off: Callable[[float], float] = lambda _: 0.0) -> None:
+        """A vehicle at rest, whose receiver is off to the north by so many metres at a second."""
+        for number in range(round(seconds * 50)):
+            second, wobble = begin_s + number / 50, 0.01 * (number % 7 - 3)
+            self._take("imu0", second, ImuSample((wobble, 0.0, -9.81), (1e-4, wobble / 10, 0.0)))
+            if number % 10 == 0:
+                latitude = math.radians(48.0) + metres_off(second) / 6.4e6
+                self._take("gps0.position", second + 1e-3, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
+                self._take("gps0.velocity", second + 1e-3, GnssVelocity(0.0, 0.0, 0.0, 0.1))
+        self._engine.finish()
+
+    def _take(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
+        t_ns = 1_700_000_000 * SECOND + round(second * SECOND)
+        assert self._engine.feed(Received(source, t_ns, "unix", t_ns, t_ns, payload)) is not None
+
+
+def test_a_reset_is_published_with_its_reason(tmp_path: Path) -> None:
+    """A receiver that stays 300 m away is taken as right in the end; before that its measurements are rejected."""
+    settings = configuration(tmp_path, "udpin:127.0.0.1:1")
+    settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, gnss_reset_s=10.0))
+    player = Player(settings)
+    player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
+    messages = player.told
+    why = "gps0.position was rejected too long with a constant error; the state was set to it"
+    events = [message for message in messages if isinstance(message, EventMessage)]
+    assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
+    assert [message.subject for message in events if message.kind == "mode"] == [
+        "aligning", "nominal", "dead_reckoning", "nominal",
+    ]  # fmt: skip
+    positions = [m for m in messages if isinstance(m, InnovationMessage) and m.source == "gps0.position"]
+    rejected = [message for message in positions if message.outcome == "rejected"]
+    assert len(rejected) > 40 and all((message.test_ratio or 0) > 1 for message in rejected)
+    assert rejected[0].innovation[0] == pytest.approx(300, abs=2)
+    health = [message for message in messages if isinstance(message, HealthMessage)]
+    assert (health[-1].resets, health[-1].reset_reason) == (1, why)
+    jump = next(message for message in health if message.resets == 1)
+    assert jump.t_ns == next(message.t_ns for message in events if message.kind == "reset")  # at once
+
+
+def test_a_hole_in_the_data_is_published(tmp_path: Path) -> None:
+    settings = configuration(tmp_path, "udpin:127.0.0.1:1")
+    settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, restart_gap_s=3.0))
+    player = Player(settings)
+    player.play(2.0)
+    player.play(2.0, begin_s=7.0)
+    texts = [message.text for message in player.told if isinstance(message, EventMessage)]
+    assert "state reset: no data for more than 3 s; aligning again" in texts
+    assert "imu0: nothing received for 2 s" in texts
