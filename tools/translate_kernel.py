@@ -238,7 +238,9 @@ def functions() -> dict[FunctionType, Function]:
                 text = ast.unparse(hint) if hint else ""
                 if text.startswith("tuple["):
                     assert isinstance(hint, ast.Subscript) and isinstance(hint.slice, ast.Tuple)
-                    return Kind("tuple", items=tuple(kind_of(item) for item in hint.slice.elts))
+                    items = tuple(kind_of(item) for item in hint.slice.elts)
+                    if all(item.is_scalar for item in items):
+                        return Kind("tuple", items=items)
                 if text not in KINDS:
                     raise UntranslatableError(f"{name}:{tree.lineno}: {tree.name}: no translation of the type '{text}'")
                 return KINDS[text]
@@ -265,6 +267,15 @@ class Value:
         return f"{bracketed(self.code)}[{index} * {self.kind.stride}]"
 
 
+def _without_calls(node: ast.expr) -> Iterator[ast.expr]:
+    """The expressions of an expression, but not those handed to a function: what that returns is apart."""
+    yield node
+    if not isinstance(node, ast.Call):
+        for part in ast.iter_child_nodes(node):
+            if isinstance(part, ast.expr):
+                yield from _without_calls(part)
+
+
 def bracketed(code: str) -> str:
     return code if code.replace("_", "").replace(".", "").isalnum() else f"({code})"
 
@@ -278,6 +289,7 @@ class Translation:
         self._locals: dict[str, Kind] = dict(function.parameters)
         self._views = {name for name, kind in function.parameters.items() if not kind.is_scalar}
         self._aliases: set[str] = set()  # views that are pointers of their own
+        self._seen_elsewhere: set[str] = set()  # arrays that these views are of
         self._declared: list[str] = []
         self._lines: list[str] = []
         self._depth = 1
@@ -325,13 +337,15 @@ class Translation:
             case ast.AnnAssign(target=ast.Name(id=name), value=value) if value is not None:
                 kind = KINDS.get(ast.unparse(node.annotation))
                 if kind is not None and kind.is_scalar:
-                    self._declare(name, kind)
+                    self._declare(name, kind, node)
                 self._assign_to(node.target, self._expression(value), node)
             case ast.AugAssign():
                 self._augment(node)
             case ast.If():
                 self._if(node)
             case ast.While():
+                if node.orelse:
+                    self._fail(node, "a loop has no else")
                 before = len(self._lines)
                 test = self._scalar(node.test)
                 if len(self._lines) != before:
@@ -366,7 +380,7 @@ class Translation:
         if not isinstance(node.target, ast.Name) or node.orelse:
             self._fail(node, "a loop has one name and no else")
         name = node.target.id
-        self._declare(name, INT)
+        self._declare(name, INT, node)
         if isinstance(node.iter, ast.Call) and isinstance(node.iter.func, ast.Name) and node.iter.func.id == "range":
             bounds = ", ".join(self._scalar(bound) for bound in node.iter.args)
             self._emit(f"for {name} in range({bounds}):")
@@ -429,8 +443,6 @@ class Translation:
 
     def _is_fresh(self, node: ast.expr) -> bool:
         """Whether an expression makes a new array or struct, which a name can be."""
-        if isinstance(node, ast.List):
-            return True
         if not isinstance(node, ast.Call):
             return False
         text = ast.unparse(node.func)
@@ -445,7 +457,7 @@ class Translation:
         text = ast.unparse(node.func)
         if text == "Observation" or text.endswith(".hypothesis"):
             struct = "Observation" if text == "Observation" else "State"
-            self._declare(name, Kind("struct", struct))
+            self._declare(name, Kind("struct", struct), statement)
             if struct == "State":
                 assert isinstance(node.func, ast.Attribute)
                 state = self._pointer(node.func.value)
@@ -453,8 +465,7 @@ class Translation:
             return
         kind = self._shape(node)
         if name in self._locals:
-            if self._locals[name] != kind:
-                self._fail(statement, f"{name} was something else before")
+            self._check_own(name, kind, statement)
             taken = self._temporary(f"double@[{size_of(kind)}]")
             self._fill(taken, node, size_of(kind))
             self._copy(name, taken, size_of(kind))
@@ -537,10 +548,12 @@ class Translation:
             if all(value.kind.is_scalar for value in values):
                 for name, value in zip(names, values, strict=True):
                     if name:
-                        self._declare(name, value.kind)
+                        self._declare(name, value.kind, statement)
                 targets = ", ".join(self._target(item).code for item in target.elts)
                 self._emit(f"{targets} = {', '.join(value.code for value in values)}")
                 return
+            if set(names) & {name.id for item in node.elts for name in ast.walk(item) if isinstance(name, ast.Name)}:
+                self._fail(statement, "arrays cannot be exchanged")
             for item, value in zip(target.elts, values, strict=True):
                 self._assign_to(item, value, statement)
             return
@@ -551,7 +564,7 @@ class Translation:
             for number, (item, kind) in enumerate(zip(target.elts, value.kind.items, strict=True)):
                 self._assign_to(item, Value(f"{kept}[{number}]", kind), statement)
             return
-        if value.kind.name == "vector":
+        if value.kind.name == "vector" and all(isinstance(item, ast.Name) for item in target.elts):
             for number, item in enumerate(target.elts):
                 scalar = FLOAT if value.kind.of == "double" else INT
                 self._assign_to(item, Value(value.at(str(number)), scalar), statement)
@@ -562,12 +575,14 @@ class Translation:
         if isinstance(target, ast.Name):
             name = target.id
             if value.kind.is_scalar or value.kind.name == "pointer":
-                self._declare(name, value.kind)
+                self._declare(name, value.kind, statement)
                 self._emit(f"{name} = {value.code}")
             elif value.is_view and name not in self._locals:
                 self._locals[name] = value.kind
                 self._views.add(name)
                 self._aliases.add(name)
+                source = statement.value if isinstance(statement, ast.Assign | ast.AnnAssign) else statement
+                self._seen_elsewhere |= {part.id for part in ast.walk(source or statement) if isinstance(part, ast.Name)}
                 self._declared.append(f"{value.kind.of}* {name}")
                 self._emit(f"{name} = {value.code}")
             elif value.is_view and name in self._aliases and self._locals[name] == value.kind:
@@ -578,6 +593,7 @@ class Translation:
                 self._fail(statement, "a name is one thing only")
             return
         place = self._target(target)
+        self._check_overlap(target, statement)
         if place.kind.is_scalar:
             self._emit(f"{place.code} = {value.code}")
         elif place.kind.name in ("vector", "matrix"):
@@ -592,9 +608,40 @@ class Translation:
             self._locals[name] = kind
             self._views.add(name)
             self._declared.append(f"double {name}[{kind.size}]")
-        elif self._locals[name] != kind:
-            self._fail(statement, f"{name} was something else before")
+        else:
+            self._check_own(name, kind, statement)
         self._store(Value(name, kind, is_view=True), value, statement)
+
+    def _check_own(self, name: str, kind: Kind, statement: ast.stmt) -> None:
+        """An array can be made anew, in its own memory, where nothing else can see it."""
+        if self._locals[name] != kind:
+            self._fail(statement, f"{name} was something else before")
+        if name in self._aliases or name in self._function.parameters or name in self._seen_elsewhere:
+            self._fail(statement, f"{name} is not only this function's own array")
+
+    def _check_overlap(self, target: ast.expr, statement: ast.stmt) -> None:
+        """A part of a vector is written element by element: it must not be worked out from another part that it meets."""
+        if not isinstance(target, ast.Subscript) or not isinstance(statement, ast.Assign | ast.AugAssign):
+            return
+        to = self._part(target)
+        parts = list(_without_calls(statement.value))
+        for part in (part for part in parts if isinstance(part, ast.Subscript)):
+            if to is None or ast.unparse(part.value) != ast.unparse(target.value):
+                continue
+            by = self._part(part)
+            if by is None or by == to:
+                continue
+            if not all(number.isdigit() for number in (*to, *by)) or (
+                int(to[0]) < int(by[0]) + int(by[1]) and int(by[0]) < int(to[0]) + int(to[1])
+            ):
+                self._fail(statement, "these parts of one array may overlap")
+
+    def _part(self, node: ast.Subscript) -> tuple[str, str] | None:
+        """Begin and length where a node is a part of a vector."""
+        if isinstance(node.slice, ast.Constant | ast.Tuple):
+            return None
+        owner = self._expression(node.value)
+        return self._slice(node.slice, owner.kind.size) if owner.kind.name == "vector" else None
 
     def _store(self, place: Value, value: Value, statement: ast.stmt) -> None:
         """Element by element; a scalar goes into all of them."""
@@ -617,8 +664,12 @@ class Translation:
         if sign is None:
             self._fail(node, "no translation of this operator")
         place = self._target(node.target)
+        self._check_overlap(node.target, node)
         if place.kind.is_scalar:
-            self._emit(f"{place.code} {sign}= {self._scalar(node.value)}")
+            value = self._number(node.value)
+            if place.kind != FLOAT and (value.kind == FLOAT or sign == "/"):
+                self._fail(node, "this makes a float of an int")
+            self._emit(f"{place.code} {sign}= {value.code}")
             return
         scaled = node.value
         if (
@@ -639,13 +690,17 @@ class Translation:
             self._emit(f"    axpy({place.code} + {index} * {place.kind.columns}, {column.at(index)}, {row.code})")
             return
         value = self._expression(node.value)
+        if place.kind.name != "vector" or not (value.kind.is_scalar or value.kind.name == "vector"):
+            self._fail(node, "only vectors are added to like this")
         size = place.kind.size or value.kind.size
+        if not size:
+            self._fail(node, "how long is this?")
         index = self._index()
         code = self._kept(value) if value.kind.is_scalar else value.at(index)
         self._emit(f"for {index} in range({size}):")
         self._emit(f"    {place.at(index)} {sign}= {code}")
 
-    def _declare(self, name: str, kind: Kind) -> None:
+    def _declare(self, name: str, kind: Kind, node: ast.AST) -> None:
         known = self._locals.get(name)
         if known is None:
             self._locals[name] = kind
@@ -653,8 +708,7 @@ class Translation:
                 self._views.add(name)
             self._declared.append(f"{kind.of if kind.name == 'struct' else kind.c} {name}")
         elif known != kind and not (known == FLOAT and kind == INT):
-            where = self._function.module.__name__
-            raise UntranslatableError(f"{where}: {self._function.call.__name__}: {name} is {known.name} and {kind.name}")
+            self._fail(node, f"{name} is {known.name} and {kind.name}")
 
     def _temporary(self, c: str, word: str = "t") -> str:
         self._temporaries += 1
@@ -672,9 +726,21 @@ class Translation:
     # --- Expressions
 
     def _scalar(self, node: ast.expr) -> str:
+        return self._number(node).code
+
+    def _number(self, node: ast.expr) -> Value:
         value = self._expression(node)
         if not value.kind.is_scalar:
             self._fail(node, f"this is a {value.kind.name}, not a number")
+        return value
+
+    def _index_of(self, node: ast.expr) -> str:
+        """An index or a bound of a slice. In C a negative one is a place before the array."""
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+            self._fail(node, "an index counts from the begin")
+        value = self._number(node)
+        if value.kind != INT:
+            self._fail(node, f"this is a {value.kind.name}, not an index")
         return value.code
 
     def _pointer(self, node: ast.expr) -> str:
@@ -723,8 +789,7 @@ class Translation:
             case ast.UnaryOp():
                 return self._unary(node)
             case ast.BoolOp(op=op, values=values):
-                word = " and " if isinstance(op, ast.And) else " or "
-                return Value(f"({word.join(self._scalar(value) for value in values)})", BOOL)
+                return self._both_or_either(" and " if isinstance(op, ast.And) else " or ", values)
             case ast.Compare():
                 return self._compare(node)
             case ast.IfExp(test=test, body=body, orelse=orelse):
@@ -733,11 +798,26 @@ class Translation:
                 return self._call(node)
         self._fail(node, "no translation of this expression")
 
+    def _both_or_either(self, word: str, nodes: list[ast.expr]) -> Value:
+        codes: list[str] = []
+        for node in nodes:
+            before = len(self._lines)
+            value = self._number(node)
+            if value.kind != BOOL:
+                self._fail(node, f"this is a {value.kind.name}, not true or false")
+            if codes and len(self._lines) != before:
+                self._fail(node, "what may not be worked out cannot need temporaries")
+            codes.append(value.code)
+        return Value(f"({word.join(codes)})", BOOL)
+
     def _choice(self, test: ast.expr, body: ast.expr, orelse: ast.expr) -> Value:
         if isinstance(orelse, ast.Constant) and orelse.value is None:
             value = self._expression(body)
             return Value(f"({value.code} if {self._scalar(test)} else NULL)", value.kind, is_view=True)
+        before = len(self._lines)
         one, other = self._expression(body), self._expression(orelse)
+        if len(self._lines) != before:
+            self._fail(test, "what may not be worked out cannot need temporaries")
         if not (one.kind.is_scalar and other.kind.is_scalar):
             self._fail(test, "a choice is between numbers")
         kind = FLOAT if FLOAT in (one.kind, other.kind) else one.kind
@@ -769,10 +849,12 @@ class Translation:
     def _slice(self, node: ast.expr, total: str) -> tuple[str, str] | None:
         """Begin and length of a slice of `total` elements; None where the node is an index."""
         if isinstance(node, ast.Slice):
+            if node.step is not None:
+                self._fail(node, "a slice has no step")
             if node.lower is None and node.upper is None:
                 return "0", total
-            low = self._scalar(node.lower) if node.lower else "0"
-            high = self._scalar(node.upper) if node.upper else ""
+            low = self._index_of(node.lower) if node.lower else "0"
+            high = self._index_of(node.upper) if node.upper else ""
             if high and low.isdigit() and high.isdigit():
                 return low, str(int(high) - int(low))
             return low, f"({high or total} - {low})"
@@ -796,29 +878,31 @@ class Translation:
         owner = self._expression(node.value)
         kind = owner.kind
         if kind.name == "pointer" and kind.size == "rows":
-            return Value(f"({owner.code} + {self._scalar(node.slice)})", Kind("pointer", kind.of), is_view=True)
+            return Value(f"({owner.code} + {self._index_of(node.slice)})", Kind("pointer", kind.of), is_view=True)
         if not owner.is_view:
             self._fail(node, "an element of what is no view")
         scalar = FLOAT if kind.of == "double" else INT
         if kind.name == "vector":
             part = self._slice(node.slice, kind.size)
             if part is None:
-                return Value(owner.at(self._scalar(node.slice)), scalar)
+                return Value(owner.at(self._index_of(node.slice)), scalar)
             begin, length = part
+            if kind.stride != "1":
+                self._fail(node, "a part of a column has no translation")
             code = owner.code if begin == "0" else f"{owner.code} + {begin}"
             return Value(code, vector(length or kind.size, kind.of, kind.stride), is_view=True)
         if isinstance(node.slice, ast.Tuple):
             first, second = node.slice.elts
             rows, columns = self._slice(first, kind.size), self._slice(second, kind.columns)
             if rows is None and columns is None:
-                row, column = self._scalar(first), self._scalar(second)
+                row, column = self._index_of(first), self._index_of(second)
                 return Value(f"{bracketed(owner.code)}[({row}) * {kind.columns} + {column}]", scalar)
             if rows is None and columns is not None:
                 begin, length = columns
-                code = f"{owner.code} + ({self._scalar(first)}) * {kind.columns}" + (f" + {begin}" if begin != "0" else "")
+                code = f"{owner.code} + ({self._index_of(first)}) * {kind.columns}" + (f" + {begin}" if begin != "0" else "")
                 return Value(code, vector(length or kind.columns, kind.of), is_view=True)
             if rows is not None and columns is None:
-                code = f"{owner.code} + {self._scalar(second)}" + (
+                code = f"{owner.code} + {self._index_of(second)}" + (
                     f" + ({rows[0]}) * {kind.columns}" if rows[0] != "0" else ""
                 )
                 return Value(code, vector(rows[1] or kind.size, kind.of, kind.columns), is_view=True)
@@ -828,7 +912,7 @@ class Translation:
             return owner
         if rows is not None:
             self._fail(node, "rows of a matrix have no translation: use loops")
-        row = self._scalar(node.slice)
+        row = self._index_of(node.slice)
         return Value(f"{owner.code} + ({row}) * {kind.columns}", vector(kind.columns, kind.of), is_view=True)
 
     def _binary(self, node: ast.BinOp) -> Value:
