@@ -21,10 +21,12 @@ from fusiond.filter.state import (
     PHASE,
     POSITION_E,
     QUATERNION_EB,
+    RESET_REASON,
     RESETS,
     RUNNING,
     T_START,
     VELOCITY_E,
+    ResetReason,
     T,
 )
 from fusiond.filter.step import LOST_HEADING, yaw_variance
@@ -190,7 +192,8 @@ def test_starts_again_after_a_gap(compiled: bool, gap_s: float, resets: int) -> 
     assert head.stamps[RESETS] >= resets
     assert bool(head.stamps[T_START] > T0 + 4 * SECOND) is bool(resets)
     if resets:
-        assert head.stamps[RESETS] == 1
+        reason = ResetReason.DATA_GAP if gap_s > 30.0 else ResetReason.HEADING_LOST
+        assert (head.stamps[RESETS], head.stamps[RESET_REASON]) == (1, reason)
         np.testing.assert_allclose(head.nominal[POSITION_E], second.position_e[-1], atol=2.0)
         np.testing.assert_allclose(head.nominal[VELOCITY_E], second.velocity_e[-1], atol=0.3)
         assert attitude(fusion)[2] == pytest.approx(math.degrees(2.0), abs=1.5)
@@ -218,6 +221,7 @@ def test_an_autopilot_that_reboots_in_a_bend(compiled: bool, silence_s: float, r
     fusion = fuse(config(), without(silence_s, measurements(truth)), compiled)
     head = fusion.history.head
     assert (head.stamps[PHASE], head.stamps[RESETS]) == (RUNNING, resets)
+    assert head.stamps[RESET_REASON] == (ResetReason.HEADING_LOST if resets else ResetReason.NONE)
     np.testing.assert_allclose(head.nominal[POSITION_E], truth.position_e[-1], atol=2.0)
     np.testing.assert_allclose(head.nominal[VELOCITY_E], truth.velocity_e[-1], atol=0.3)
     off = attitude(fusion)[2] - math.degrees(HEADING + 0.2 * 18.0)
@@ -312,6 +316,7 @@ def test_a_state_that_is_not_finite_is_emptied(compiled: bool, place: str, poiso
                 estimate = fusion.estimate_at(event.t_ns).state
                 assert estimate is None or math.isfinite(sum(estimate.velocity_n) + estimate.covariance.sum())
     assert (head.stamps[BLOWN], head.stamps[RESETS], head.stamps[PHASE]) == (1, 1, RUNNING)
+    assert head.stamps[RESET_REASON] == ResetReason.NOT_FINITE
     assert np.isfinite(head.numbers).all()
     roll, pitch, yaw = euler(matrix_from_euler(*np.radians(attitude(fusion))))
     assert (roll, pitch, yaw) == (pytest.approx(0.0, abs=0.03), pytest.approx(0.0, abs=0.03), pytest.approx(0.4, abs=0.04))

@@ -301,7 +301,8 @@ def test_reset_after_a_long_rejection(kind: str) -> None:
     for since, resets in ((wait, 1), (wait - 1, 0), (None, 0)):
         state.source_stamps[source, T_ALIKE] = NEVER if since is None else T0 - since
         fusion, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
-        assert fusion.history.head.stamps[RESETS] == resets
+        reason = ResetReason.SOURCE_RETURNED if resets else ResetReason.NONE
+        assert reset_by(fusion) == (resets, reason, KINDS[kind] if resets else settings.sources()[0])
         assert fusion.history.rows[0]["outcome"] == (Outcome.FUSED if resets else Outcome.REJECTED)
         assert fusion.history.rows[0]["ratio"] > 1
         assert np.linalg.eigvalsh(fusion.history.head.covariance).min() > 0
