@@ -27,9 +27,8 @@ from fusiond.app.replay.summary import Summary
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config
 from fusiond.estimator.fusion import state_estimate
-from fusiond.filter.heading_bank import alive
 from fusiond.filter.source_health import STATUSES
-from fusiond.filter.state import CHOOSING, LAST_VALUE, PHASE
+from fusiond.filter.state import CHOOSING, LAST_SPEED, PHASE
 from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMessage
 from fusiond.simulation.scenario import parse
 from fusiond_adapters.logs.merge import open_logs
@@ -265,7 +264,7 @@ def draw_bank() -> None:
         head, kernel = run.fusion.history.head, run.fusion.history.kernel
         if message.state:
             return message.state.yaw_deg % 360, message.state.sigma_yaw_deg
-        left = alive(head) if head.stamps[PHASE] == CHOOSING else []
+        left = np.flatnonzero(head.bank[:, 0]) if head.stamps[PHASE] == CHOOSING else []
         yaws = (math.degrees(state_estimate(head.hypothesis(i), kernel).euler()[2]) % 360 for i in left)
         return (math.nan, *(number for i, yaw in zip(left, yaws, strict=True) for number in (float(head.bank[i, 0]), yaw)))
 
@@ -294,7 +293,7 @@ def draw_slip() -> None:
     def look(run: Replay, message: StateMessage) -> tuple[float, ...]:
         """Estimated speed, the wheel's speed, and the probabilities of the wheel's health."""
         head, history = run.fusion.history.head, run.fusion.history
-        wheel = float(head.memory[history.index["rear_left"], LAST_VALUE])
+        wheel = float(head.memory[history.index["rear_left"], LAST_SPEED])
         speed = math.hypot(*message.state.velocity_ned_mps[:2]) if message.state else math.nan
         return speed, wheel, *run.fusion.beliefs(message.t_ns)["rear_left"].probabilities
 
