@@ -1,6 +1,6 @@
 """Makes the compiled kernel's source out of the filter's own: typed Python functions in, Cython out.
 
-    python tools/translate_kernel.py            write layout.pxi and functions.pxi in fusiond/filter/kernel
+    python tools/translate_kernel.py            write the generated files of fusiond/filter/kernel
     python tools/translate_kernel.py --check    exit with 1 where one of them is not what would be written
 
 The filter's functions that run for every event are written once, in Python, in fusiond/maths and fusiond/filter; the
@@ -45,6 +45,18 @@ SIZES = {  # constants that the structs and the kernel's class need by name, and
 }  # fmt: skip
 HEAD = """\
 # Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
+"""
+
+
+WIDTH = """\
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+# Made by tools/translate_kernel.py: not to be edited.
+\"\"\"The compiled hot loop (kernel.pxi) for {about}: see there.\"\"\"
+
+cdef enum:
+    n = {size}  # error states
+
+include "kernel.pxi"
 """
 
 
@@ -1116,7 +1128,10 @@ def bodies() -> str:
 
 def made() -> dict[Path, str]:
     """The files and their text."""
-    return {KERNEL / "layout.pxi": layout(), KERNEL / "functions.pxi": bodies()}
+    state = importlib.import_module("fusiond.filter.state")
+    widths = {"narrow": ("the ordinary state", state.ERROR_SIZE), "wide": ("the state with all calibrations", state.WIDE_SIZE)}
+    files = {KERNEL / f"{name}.pyx": WIDTH.format(about=about, size=size) for name, (about, size) in widths.items()}
+    return files | {KERNEL / "layout.pxi": layout(), KERNEL / "functions.pxi": bodies()}
 
 
 def main(arguments: list[str]) -> int:
