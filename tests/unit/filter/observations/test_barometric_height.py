@@ -16,7 +16,6 @@ from fusiond.events import GnssPosition, Measurement, Pressure
 from fusiond.filter.calibration import calibrations
 from fusiond.filter.kernel.interpreted import compiled_available
 from fusiond.filter.observations import barometric_height
-from fusiond.filter.observations.barometric_height import LAYERS, pressure_altitude
 from fusiond.filter.observations.model import PARAMETERS, Unusable
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
@@ -38,16 +37,6 @@ from tests.conftest import needs_compiled
 from tests.helpers.observations import observed
 from tests.helpers.streams import MS, MUNICH, SECOND, T0, bits, config, fuse, measurements, same_bits, town
 
-ICAO = {  # geopotential height [m]: pressure [Pa], ICAO Doc 7488/3, tables
-    -500: 107_478.0,
-    0: 101_325.0,
-    1_000: 89_874.6,
-    5_000: 54_019.9,
-    11_000: 22_632.0,
-    15_000: 12_044.5,
-    20_000: 5_474.87,
-    25_000: 2_511.01,
-}
 OFFSET = 45.0  # m, of the readings below
 DRIVE = town(30.0)
 HILL = """
@@ -92,18 +81,6 @@ def ordered(events: list[Measurement]) -> list[Measurement]:
 def offset_of(fusion: Fusion) -> tuple[float, float]:
     """The height offset and its sigma [m]."""
     return calibrations(fusion.plan, fusion.history.head)["height_offset_m"]
-
-
-@pytest.mark.parametrize(("height", "at"), ICAO.items())
-def test_the_standard_atmosphere(height: float, at: float) -> None:
-    assert pressure_altitude(at) == pytest.approx(height, abs=0.3)
-
-
-def test_the_layers_meet() -> None:
-    for base, height, *_ in LAYERS[1:]:
-        for factor in (1 - 1e-9, 1.0, 1 + 1e-9):
-            assert pressure_altitude(base * factor) == pytest.approx(height, abs=0.01)
-    assert pressure_altitude(LAYERS[0][0]) == 0.0
 
 
 def test_values_and_parameters() -> None:
