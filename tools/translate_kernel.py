@@ -1129,7 +1129,8 @@ def bodies() -> str:
 def made() -> dict[Path, str]:
     """The files and their text."""
     state = importlib.import_module("fusiond.filter.state")
-    widths = {"narrow": ("the ordinary state", state.ERROR_SIZE), "wide": ("the state with all calibrations", state.WIDE_SIZE)}
+    wide = ("the state with all calibrations", state.WIDE_SIZE)
+    widths = {"narrow": ("the ordinary state", state.ERROR_SIZE), "wide": wide}
     files = {KERNEL / f"{name}.pyx": WIDTH.format(about=about, size=size) for name, (about, size) in widths.items()}
     return files | {KERNEL / "layout.pxi": layout(), KERNEL / "functions.pxi": bodies()}
 

@@ -103,7 +103,8 @@ def measure(state: FilterState, i: int, model: int, values: Vector, parameter: V
 
 @compiled
 def constrain(state: FilterState, plan: Plan) -> None:
-    """Apply the motion constraints that are due to every hypothesis; one that would have the vehicle go sideways pays."""
+    """Apply the motion constraints that are due to every hypothesis; one in which the vehicle goes sideways
+    loses weight."""
     still, rolling = constraints_due(state, plan)
     if not (still or rolling):
         return
@@ -155,7 +156,7 @@ def normalise(state: FilterState) -> None:
 
 
 @compiled
-def settle(state: FilterState, plan: Plan) -> None:
+def collapse_if_close(state: FilterState, plan: Plan) -> None:
     """Normalise, and collapse the bank where the headings are close together and hardly any is far off: the filter then
     runs."""
     normalise(state)
@@ -219,7 +220,7 @@ def _collapse(state: FilterState, best: int, errors: ErrorRows3) -> None:
     inject(state, mean)
     state.bank[:] = 0.0
     state.stamps[PHASE] = RUNNING
-    if state.stamps[HOT_START] == Verdict.BELIEVED:  # its state was published meanwhile
+    if state.stamps[HOT_START] == Verdict.USED:  # its state was published meanwhile
         state.stamps[RESETS] += 1
         state.stamps[RESET_REASON] = ResetReason.HEADING_DECIDED
     for source in range(state.sources):

@@ -1,9 +1,9 @@
-"""What a stored state is worth at the start: checked against what was gathered, before any of it is believed.
+"""What a stored state is worth at the start: checked against what was gathered, before any of it is used.
 
 Biases and calibrations are first values, with variances aged by their random walks. The heading is another matter: a
-vehicle can have been turned while nobody looked, and a running filter does not find back from a wrong heading. So it is
-only ever one hypothesis of the bank, next to the twelve all round, and the drive decides. Where place, standstill and
-level agree it leads the bank, and as long as it does, its state is told: a parked vehicle has one at once.
+vehicle can have been turned unnoticed, and a running filter does not recover from a wrong heading. So it is only ever
+one hypothesis of the bank, next to the twelve all round, and the drive decides. Where place, standstill and
+level agree it leads the bank, and as long as it does, its state is published: a parked vehicle has one at once.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from fusiond.maths.rotation import matrix_from_euler, product
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import ecef, mat_ne
 
-BELIEVED_WEIGHT = 0.8  # of the stored heading where all agrees: it takes evidence, not chance, to collapse the bank on it
-LEADS = 0.5  # weight from which it is told as the state
+USED_WEIGHT = 0.8  # of the stored heading where all agrees: it takes evidence, not chance, to collapse the bank on it
+LEADS = 0.5  # weight from which its state is published
 DOUBTED_WEIGHT = 0.5  # and where only the place does
-BELIEVED_SIGMA = math.radians(3.0)  # rad, at the least: parked is not nailed down
+USED_SIGMA = math.radians(3.0)  # rad, at the least: parked is not nailed down
 DOUBTED_SIGMA = math.radians(15.0)  # rad, at the least: some turning of the wheel
 USELESS_SIGMA = math.radians(30.0)  # rad: a heading no better than this is none
 LEVEL_AGREES = math.radians(1.5)  # rad: passengers and fuel tilt no vehicle more; on a slope turning does
 SHARP = 10.0  # m: places known no better than this tell little
 ROLLED = 20.0  # m, how far a vehicle that was parked may have gone before the filter starts
-BRIEF = 5.0  # s: for so long after a stop in motion its heading is worth something
+BRIEF = 5.0  # s: how long after a stop in motion its heading is worth something
 
 
 WORDS = {
     Verdict.NONE: "no start yet",
-    Verdict.BELIEVED: "heading, biases and calibration taken: same place, at rest, level as before",
+    Verdict.USED: "heading, biases and calibration taken: same place, at rest, level as before",
     Verdict.DOUBTED: "biases and calibration taken; its heading is tried among others",
     Verdict.OTHERWISE_KNOWN: "biases and calibration taken; the heading is known otherwise",
     Verdict.MOVED: "biases and calibration taken; its heading and position ignored: the vehicle is elsewhere",
@@ -111,23 +111,23 @@ def heading(
         return None, Verdict.MOVED
     agrees = level is not None and max(abs(level[0] - stored.roll), abs(level[1] - stored.pitch)) <= LEVEL_AGREES
     if agrees and stored.at_rest and spread <= square(SHARP):
-        return Heading(stored.yaw, max(sigma, BELIEVED_SIGMA), BELIEVED_WEIGHT), Verdict.BELIEVED
+        return Heading(stored.yaw, max(sigma, USED_SIGMA), USED_WEIGHT), Verdict.USED
     return Heading(stored.yaw, max(sigma, DOUBTED_SIGMA), DOUBTED_WEIGHT), Verdict.DOUBTED
 
 
 def leads(state: FilterState, plan: Plan) -> bool:
-    """Whether a bank is so sure of the stored heading that its state is told."""
-    if state.stamps[PHASE] != CHOOSING or state.stamps[HOT_START] != Verdict.BELIEVED:
+    """Whether a bank is so sure of the stored heading that its state is published."""
+    if state.stamps[PHASE] != CHOOSING or state.stamps[HOT_START] != Verdict.USED:
         return False
     return bool(state.bank[STORED, 0] >= LEADS)
 
 
 def leading(state: FilterState) -> FilterState:
-    """A copy that runs with the stored heading: to be told, and thrown away."""
-    told, hypothesis = state.copy(), state.hypothesis(STORED)
-    told.nominal[:], told.covariance[:] = hypothesis.nominal, hypothesis.covariance
-    told.stamps[PHASE] = RUNNING
-    return told
+    """A copy that runs with the stored heading, for publication."""
+    published, hypothesis = state.copy(), state.hypothesis(STORED)
+    published.nominal[:], published.covariance[:] = hypothesis.nominal, hypothesis.covariance
+    published.stamps[PHASE] = RUNNING
+    return published
 
 
 def _distance(stored: StoredState, fix_e: Array, lever_b: Array) -> float:

@@ -2,7 +2,7 @@
 
 While aligning, the state only gathers: means of the inertial samples (`motion.watch`), the last fix, the velocity at the
 begin of a window. It starts at the first event at which position, level and heading are known. In motion, the vehicle's
-own acceleration, as the change of GNSS velocity tells it, is taken out of the accelerometer before leveling. What an
+own acceleration, known from the change of GNSS velocity, is taken out of the accelerometer before leveling. What an
 earlier run has stored is judged in `fusiond.filter.hot_start`.
 """
 
@@ -81,9 +81,9 @@ from fusiond.maths.typed import Array, compiled
 from fusiond.maths.wgs84 import geodetic_trig, mat_ne, mat_ne_from_trig
 
 FIX_FRESH_NS = 2 * SECOND  # a fix older than this does not start the filter
-MIN_WINDOW_NS = SECOND  # the GNSS velocities that tell the vehicle's acceleration lie at least so far apart
+MIN_WINDOW_NS = SECOND  # the GNSS velocities that give the vehicle's acceleration lie at least so far apart
 MAX_WINDOW_NS = 3 * SECOND  # and at most so far
-REST_FRESH_NS = 600 * SECOND  # a standstill longer ago tells nothing of the gyro bias
+REST_FRESH_NS = 600 * SECOND  # a standstill longer ago says nothing about the gyro bias
 REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
 ALL_ROUND = 12  # hypotheses of an unknown heading
 BANK_SIGMA = math.radians(12.0)  # rad, of each: wide enough to overlap
@@ -171,7 +171,7 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
 
 
 def _given(state: FilterState, plan: Plan) -> tuple[float, float] | None:
-    """The configured heading and its sigma [rad]: of the first start, and of later ones where nothing tells a newer one."""
+    """The configured heading and its sigma [rad]: of the first start, and of later ones where there is no newer one."""
     if plan.filter.heading_deg is None or (state.stamps[RESETS] and plan.velocities):
         return None
     return math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)

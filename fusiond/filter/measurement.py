@@ -32,12 +32,12 @@ from fusiond.filter.state import (
     POSITION_E,
     RESET_REASON,
     RESET_SOURCE,
-    T_ALIKE,
     T_BACK,
     T_FUSED,
     T_LAST,
     T_POSITION,
     T_REJECTED,
+    T_SAME_ERROR,
     FilterState,
     ResetReason,
 )
@@ -46,7 +46,7 @@ from fusiond.maths.typed import Stamps, Vector, compiled
 from fusiond.maths.wgs84 import mat_ne
 
 BREAK_NS = 5_000_000_000  # rejections further apart do not belong together
-OUTAGE_NS = 10_000_000_000  # a source silent for longer comes back anew, and is new for as long
+OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
 SUSPECT = 6  # times gnss_reset_s, where the receiver's motion is in question
 NEAR = 9.0  # test ratio up to which a fix after an outage is taken as right soon
 
@@ -132,7 +132,7 @@ def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 
         source_health.begin(memory)
         fused = True
     if fused:
-        stamps[T_REJECTED] = stamps[T_ALIKE] = NEVER
+        stamps[T_REJECTED] = stamps[T_SAME_ERROR] = NEVER
         stamps[T_FUSED] = t_ns
         if model == GNSS_POSITION:
             state.stamps[T_POSITION] = t_ns
@@ -149,17 +149,17 @@ def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, p
     contradicts the receiver's motion, as in a slowly growing spoof."""
     memory, stamps = state.memory[source], state.source_stamps[source]
     off = source_health.moved(memory, seen.innovation, seen.variance, seen.m, plan.gates[seen.m])
-    if off or stamps[T_ALIKE] == NEVER or t_ns - stamps[T_LAST] > BREAK_NS:
-        stamps[T_ALIKE] = t_ns
+    if off or stamps[T_SAME_ERROR] == NEVER or t_ns - stamps[T_LAST] > BREAK_NS:
+        stamps[T_SAME_ERROR] = t_ns
         return False
     wait = plan.gnss_reset_ns
     companion = int(plan.parameters[source, COMPANION])
-    returns = stamps[T_FUSED] == NEVER or stamps[T_ALIKE] - stamps[T_BACK] <= OUTAGE_NS
+    returns = stamps[T_FUSED] == NEVER or stamps[T_SAME_ERROR] - stamps[T_BACK] <= OUTAGE_NS
     if (returns and memory[LAST_RATIO] <= NEAR) or is_carried(state, plan):
         wait = plan.gnss_return_ns
     elif plan.models[source] == GNSS_VELOCITY or (companion >= 0 and not source_health.is_trusted(state.memory[companion])):
         wait = SUSPECT * wait
-    return t_ns - stamps[T_ALIKE] >= wait
+    return t_ns - stamps[T_SAME_ERROR] >= wait
 
 
 @compiled
@@ -212,7 +212,7 @@ def _reset_block(state: FilterState, seen: Observation, block: int) -> None:  # 
 
 @compiled
 def _reset_offset(state: FilterState, seen: Observation) -> None:
-    """The height offset anew, offset = reading - height, with the covariances that this gives it."""
+    """Set the height offset, offset = reading - height, with the covariances that this gives it."""
     p, offset = state.covariance, HEIGHT_OFFSET_ERROR.start
     state.nominal[HEIGHT_OFFSET.start] += seen.innovation[0]
     p[offset] = 0.0

@@ -1,4 +1,4 @@
-"""The configuration as the kernel wants it: numbers in arrays, one row per source, everything derived once."""
+"""The configuration as the filter needs it: numbers in arrays, one row for each source, everything derived once."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Plan:
     still_accel: float  # m/s^2
     non_holonomic: bool
     course_speed: float  # m/s
-    zero_velocity_factor: float  # creeping stays alike: weighs zero velocities down
+    zero_velocity_factor: float  # of the variance: a vehicle that creeps keeps its speed
     filter: Filter
     imu: Imu
     stored: StoredState | None  # of an earlier run, for a hot start

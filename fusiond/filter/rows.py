@@ -1,4 +1,4 @@
-"""Events as rows of one table: what the filter works on, and what became of each."""
+"""Events as rows of one table: what the filter works on, and the outcome of each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fusiond.filter.observations.model import VALUES
 
 
 class Outcome(IntEnum):
-    """What became of an event. FUSED: taken into the state, be it as a measurement or to align. REJECTED: stopped by the
+    """The outcome of an event. FUSED: taken into the state, be it as a measurement or to align. REJECTED: stopped by the
     innovation gate. TOO_OLD: stamped before the horizon. DUPLICATE: a second event of a source at one instant. INVALID:
     declared unusable by its protocol, not finite, or out of bounds. WAITING: stamped after the newest IMU sample."""
 

@@ -1,9 +1,9 @@
-"""What the filter believes of its sources: hypotheses weighed by their likelihoods, and noise that is learnt.
+"""Health of the sources: hypotheses weighed by their likelihoods, and noise that is learnt.
 
 Decision fusion (THEORY D1). Each source is one of: nominal, noisy, biased (a wheel: slipping), frozen. The evidence is the
 whitened innovation e = L^-1 d, L L' = S, which is N(0, 1) per axis while all is well, and whether the reading is the one
 before it to the bit. Bayes' rule is applied at most every `JUDGE_NS`, or twice a source's correlation time: samples
-closer than that tell the same again. A fifth hypothesis, absent (D2), needs no memory: it is weighed when it is asked for.
+closer than that say the same again. A fifth hypothesis, absent (D2), needs no memory: it is weighed when it is asked for.
 
 Nothing is certain after one sample: every hypothesis expects an outlier now and then, so an outlier is weak evidence.
 """
@@ -36,7 +36,7 @@ from fusiond.maths.portable import exp
 from fusiond.maths.typed import Array, Matrix3, Stamps, Vector, Vector3, compiled
 
 JUDGE_NS = 50_000_000  # samples closer than this share their error
-KEEPS = 20.0  # s: how long a source stays what it is
+MEAN_STATUS_TIME = 20.0  # s: how long a source keeps its status
 PRIOR = (0.997, 0.001, 0.001, 0.001)  # nominal, noisy, biased, frozen: what it becomes then
 OUTLIERS = 0.01  # share of readings that are off whatever the source is
 OUTLIER_VARIANCE = 100.0  # of such a reading, per axis, in units of S
@@ -48,7 +48,7 @@ MIN_BIAS = 3.0  # a smaller bias, in sigmas, is not called one
 SAME_IF_NOMINAL = 1 / 3  # chance that a good sensor repeats a reading to the bit
 SAME_IF_FAULTY = 1 / 20  # chance that a noisy or biased one does
 OTHER_IF_FROZEN = 1e-3  # chance that a frozen one does not
-TELLING = 4.0  # times the sensor's own variance: what more than that has told is the state, not the sensor
+MAX_STATE_VARIANCE = 4.0  # times the sensor's own: beyond, an innovation says more about the state than the sensor
 NOTED = 0.1  # a source that is noisy with at most this probability is taken as it is
 DISTRUST = 0.5  # a source that is biased or frozen with more than this probability is not fused
 ABSENT = 1e-3  # chance that a source that was heard a moment ago has gone
@@ -64,7 +64,7 @@ NIS_TIME = 10.0  # s, over which the mean of the normalised innovation squared i
 
 
 class Belief(NamedTuple):
-    """What a source is held to be: probabilities of nominal, noisy, biased, frozen and absent; the likeliest; and why."""
+    """The health of a source: probabilities of nominal, noisy, biased, frozen and absent; the likeliest; and why."""
 
     probabilities: tuple[float, float, float, float, float]
     status: str
@@ -91,7 +91,7 @@ def observes_sensor(spread: Matrix3, variance: Vector3, m: int) -> bool:
     for a in range(m):
         total += spread[a, a]
         own += variance[a]
-    return total <= TELLING * own
+    return total <= MAX_STATE_VARIANCE * own
 
 
 @compiled
@@ -115,11 +115,11 @@ def judge(memory: Vector, stamps: Stamps, whitened: Vector3, m: int, same: bool,
     innovation (m,), and whether the reading repeats the one before to the bit."""
     if memory[NOMINAL] + memory[NOISY] + memory[BIASED] + memory[FROZEN] == 0:
         begin(memory)
-    elapsed = KEEPS
+    elapsed = MEAN_STATUS_TIME
     if stamps[T_JUDGED] != NEVER:
         elapsed = (t_ns - stamps[T_JUDGED]) * 1e-9
     stamps[T_JUDGED] = t_ns
-    blurred = 1 - exp(-elapsed / KEEPS)
+    blurred = 1 - exp(-elapsed / MEAN_STATUS_TIME)
     _renew_bias(memory, whitened, m)
     nominal, noisy, biased, frozen = likelihoods(memory, whitened, m, same)
     memory[NOMINAL] = (memory[NOMINAL] + blurred * (PRIOR[0] - memory[NOMINAL])) * nominal
@@ -269,7 +269,7 @@ def moved(memory: Vector, innovation: Vector3, variance: Vector3, m: int, gate: 
 
 
 def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int) -> Belief:
-    """What is believed of a source at `t_ns`, of which the filter has run since `since_ns`.
+    """The health of a source at `t_ns`, where the filter has run since `since_ns`.
 
     Absent (THEORY D2): with detection probability P_D, each expected reading that is missing has likelihood 1 - P_D.
     """
@@ -290,12 +290,12 @@ def _reason(memory: Array, status: str, age: float) -> str:
     """What speaks for a status, for people."""
     match status:
         case "noisy":
-            return f"its squared innovations are {memory[MEAN_NIS]:.1f} times what they should be"
+            return f"squared innovations {memory[MEAN_NIS]:.1f} times as large as expected"
         case "biased":
             off = max(memory[BIAS].tolist(), key=abs)
-            return f"its readings are off to one side by {abs(off):.0f} sigma, and not fused"
+            return f"constant error of {abs(off):.0f} sigma; not fused"
         case "frozen":
-            return "it repeats one reading while the vehicle's motion says otherwise, and is not fused"
+            return "it repeats one reading while the vehicle moves; not fused"
         case "absent":
-            return f"nothing of it for {age:.1f} s"
+            return f"not received for {age:.1f} s"
     return ""

@@ -47,13 +47,13 @@ QUATERNION_EB, ATTITUDE = _nominal.block(4), _error.block(3)  # body to earth-fi
 GYRO_BIAS_B, GYRO_BIAS = _state(3)  # rad/s
 ACCEL_BIAS_B, ACCEL_BIAS = _state(3)  # m/s^2
 CALIBRATIONS = _error.size  # error states from here on belong to the installation; their nominal states follow one higher
-WHEEL_SCALE, SCALE = _state(1)  # 1: what wheels read too much: those of the first group, which is all by default
+WHEEL_SCALE, SCALE = _state(1)  # 1: how much too high wheels read: those of the first group, by default all
 MOUNT, MOUNT_ERROR = _state(2)  # rad: pitch and yaw of the IMU against the vehicle
 ERROR_SIZE = _error.size  # of the ordinary state; what follows is only in a state of WIDE_SIZE
-FURTHER_SCALES, FURTHER_SCALES_ERROR = _state(3)  # 1: what wheels of the second to fourth group read too much
+FURTHER_SCALES, FURTHER_SCALES_ERROR = _state(3)  # 1: the same of the second to fourth group
 ANTENNA_B, ANTENNA_ERROR = _state(3)  # m, what the antenna's lever arm is more than configured, b axes
 DELAYS, DELAYS_ERROR = _state(2)  # s, what the position's delay is more than configured, the velocity's more than that
-HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR = _state(1)  # m, what the barometer reads too much
+HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR = _state(1)  # m, how much too high the barometer reads
 NOMINAL_SIZE, WIDE_SIZE = _nominal.size, _error.size
 
 # Auxiliary numbers: places in FilterState.auxiliary
@@ -110,7 +110,7 @@ CONSTRAINT_REJECTED = _stamps.block(3)
 BLOWN = _stamps.one()  # count of restarts because the state was no longer finite
 RESET_REASON = _stamps.one()  # of the last jump: ResetReason
 RESET_SOURCE = _stamps.one()  # index of the source behind it, where there is one
-HOT_START = _stamps.one()  # what became of the stored state: Verdict
+HOT_START = _stamps.one()  # result of the check of the stored state: Verdict
 STAMPS_SIZE = _stamps.size
 
 # And of each source: columns of FilterState.source_stamps
@@ -119,7 +119,7 @@ T_LAST = _source_stamps.one()  # ns, of its last event
 T_FUSED = _source_stamps.one()  # ns, of its last event fused
 T_REJECTED = _source_stamps.one()  # ns, of the first of an unbroken run of rejections; NEVER if there is none
 T_JUDGED = _source_stamps.one()  # ns, of the last look at its health
-T_ALIKE = _source_stamps.one()  # ns, since when its rejected readings have the same error; NEVER if there is none
+T_SAME_ERROR = _source_stamps.one()  # ns, since when its rejected readings have the same error; NEVER if there is none
 T_BACK = _source_stamps.one()  # ns, since when it is heard again after an outage, or for the first time
 SOURCE_STAMPS_SIZE = _source_stamps.size
 
@@ -133,18 +133,18 @@ class ResetReason(IntEnum):
     """Why the state jumped."""
 
     NONE = 0
-    DATA_GAP = 1  # no data for longer than filter.restart_gap_s: it aligns anew
-    HEADING_LOST = 2  # without the inertial sensor for so long that the heading was lost: it aligns anew
-    NOT_FINITE = 3  # a number was no longer finite: it aligns anew
+    DATA_GAP = 1  # no data for longer than filter.restart_gap_s: it aligns again
+    HEADING_LOST = 2  # too long without the inertial sensor: it aligns again
+    NOT_FINITE = 3  # a number was no longer finite: it aligns again
     SOURCE_RETURNED = 4  # a source that was rejected all the time with the same error was taken as right
     HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored one
 
 
 class Verdict(IntEnum):
-    """What became of a stored state at the start."""
+    """Result of the check of a stored state at the start."""
 
     NONE = 0  # there is none, or the filter has not started yet
-    BELIEVED = 1
+    USED = 1
     DOUBTED = 2
     OTHERWISE_KNOWN = 3
     MOVED = 4

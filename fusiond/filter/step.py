@@ -50,7 +50,7 @@ from fusiond.filter.strapdown import COAST_RATE, COAST_TURN, coast, propagate
 from fusiond.maths.portable import square
 from fusiond.maths.typed import Stamps, Vector, compiled
 
-LOST_HEADING = math.radians(12.0)  # sigma, after coasting: the filter may not find back from such errors, but aligns anew
+LOST_HEADING = math.radians(12.0)  # sigma, after coasting: the filter may not recover from such errors: it aligns again
 MIN_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 
 
@@ -161,14 +161,14 @@ def _measure_lost(state: FilterState, row: Row, plan: Plan, variance: float) -> 
 
 @compiled
 def coasts(state: FilterState, t_ns: int, plan: Plan) -> bool:
-    """Whether the IMU has been silent for so long at an instant that the state coasts."""
+    """Whether the IMU has been silent for longer than `imu_gap` at an instant, so that the state coasts."""
     return t_ns - state.stamps[T_IMU] > plan.imu_gap_ns
 
 
 @compiled
-def settles(state: FilterState, source: int, plan: Plan) -> bool:
+def is_final(state: FilterState, source: int, plan: Plan) -> bool:
     """Whether no IMU sample still to come can change the state after an event of `source`: it is an IMU sample itself, or
-    the IMU has been silent for so long that the state coasts."""
+    the state coasts."""
     return plan.models[source] == IMU or coasts(state, state.stamps[T], plan)
 
 
@@ -255,7 +255,7 @@ def _choose(state: FilterState, row: Row, imu: Row | None, plan: Plan) -> None:
     own[T_FUSED] = t_ns
     if model == GNSS_POSITION:
         stamps[T_POSITION] = t_ns
-    heading_bank.settle(state, plan)
+    heading_bank.collapse_if_close(state, plan)
 
 
 @compiled
@@ -283,7 +283,7 @@ def hold(state: FilterState, values: Vector, t_ns: int) -> None:
 
 @compiled
 def guard(state: FilterState) -> None:
-    """If the state is no longer finite, empty it and align anew. Never expected; counted where it happens."""
+    """If the state is no longer finite, empty it and align again. Never expected; counted where it happens."""
     total = 0.0
     for i in range(len(state.nominal)):
         total += state.nominal[i]

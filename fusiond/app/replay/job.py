@@ -120,7 +120,7 @@ def _summary(options: Options, run: Replay, logs: LogSet, attached_warnings: Seq
         raise LogError(f"nothing in the logs that the configuration asks for ({met})")
     warnings = [with_short_names(warning, names) for warning in logs.warnings]
     summary = run.summary(options.config_name, {names[path]: counts for path, counts in logs.counts.items()}, warnings)
-    if options.stored and (verdict := run.fusion.hot_start()) is not Verdict.BELIEVED:
+    if options.stored and (verdict := run.fusion.hot_start()) is not Verdict.USED:
         warnings.append(f"stored state: {WORDS[verdict]}")
     if options.truth and summary.truth is None:
         warnings.append(f"{options.truth.name}: no published state to compare with it; is it of this drive?")

@@ -484,7 +484,7 @@ cdef void heading_bank_normalise(State* state) noexcept nogil:
         if (state.bank[(i) * BLOCK + 0] < 1e-09):
             state.bank[(i) * BLOCK + 0] = 0.0
 
-cdef void heading_bank_settle(State* state, Plan* plan) noexcept nogil:
+cdef void heading_bank_collapse_if_close(State* state, Plan* plan) noexcept nogil:
     cdef int64_t best
     cdef int64_t i
     cdef State likeliest
@@ -2094,7 +2094,7 @@ cdef bint step__measure_lost(State* state, Row* row, Plan* plan, double variance
 cdef bint step_coasts(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
     return ((t_ns - state.stamps[1]) > plan.imu_gap_ns)
 
-cdef bint step_settles(State* state, int64_t source, Plan* plan) noexcept nogil:
+cdef bint step_is_final(State* state, int64_t source, Plan* plan) noexcept nogil:
     return ((plan.models[source] == -1) or step_coasts(state, state.stamps[0], plan))
 
 cdef double step_yaw_variance(State* state) noexcept nogil:
@@ -2225,7 +2225,7 @@ cdef void step__choose(State* state, Row* row, Row* imu, Plan* plan) noexcept no
     own[1] = t_ns
     if (model == 0):
         stamps[4] = t_ns
-    heading_bank_settle(state, plan)
+    heading_bank_collapse_if_close(state, plan)
 
 cdef void step_keep_sample(State* state, Row* row, Plan* plan) noexcept nogil:
     cdef int64_t* stamps

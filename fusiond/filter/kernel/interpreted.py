@@ -16,7 +16,7 @@ from fusiond.filter.north_east_down import answer
 from fusiond.filter.parameters import Plan
 from fusiond.filter.rows import ROW, Outcome, Rows
 from fusiond.filter.state import WIDE_SIZE, FilterState, T
-from fusiond.filter.step import can_step, first_changed, place, predict, run_one, settles
+from fusiond.filter.step import can_step, first_changed, is_final, place, predict, run_one
 from fusiond.filter.strapdown import propagate
 from fusiond.maths.typed import Array
 
@@ -119,11 +119,11 @@ class Kernel:
 
 
 def keep(head: FilterState, rows: Rows, applied: int, plan: Plan, memory: Memory, kept: int) -> int:
-    """Keep the head in row `kept` of `memory` if a snapshot is due after `applied` rows, and lasts. Returns the number
+    """Keep the head in row `kept` of `memory` if a snapshot is due after `applied` rows, and final. Returns the number
     of snapshots kept."""
     numbers, whole, counts = memory
     due = head.stamps[T] - whole[kept - 1, T] >= plan.snapshot_interval_ns
-    if not due or not settles(head, int(rows[applied - 1]["source"]), plan):
+    if not due or not is_final(head, int(rows[applied - 1]["source"]), plan):
         return kept
     numbers[kept], whole[kept], counts[kept] = head.numbers, head.whole, applied
     return kept + 1

@@ -180,7 +180,7 @@ cdef class Kernel:
         cdef int64_t size = self.core_size
         if self.state.stamps[T] - self.kept_whole[kept - 1, T] < self.plan.snapshot_interval_ns:
             return kept
-        if not step_settles(&self.state, source, &self.plan):
+        if not step_is_final(&self.state, source, &self.plan):
             return kept
         if self.state.stamps[PHASE] == CHOOSING:
             size = self.numbers_size

@@ -45,7 +45,7 @@ def parameters(wheel: Wheel) -> Array:
 
 def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     """Speed [m/s], its variance (white noise, rounding to a quantum, quantum^2/12, and the reading's own), and the time over
-    which its error stays alike [s]. A wheel slower than its least speed reads 0: that tells only that it is as slow, the
+    which its error stays correlated [s]. A wheel slower than its least speed reads 0: that says only that it is as slow, the
     same from reading to reading. Raises Unusable."""
     speed, sigma, quantum, own = reading.speed, wheel.sigma_mps, wheel.quantum_mps, reading.sigma
     if not -SPEED_LIMIT <= speed <= SPEED_LIMIT:

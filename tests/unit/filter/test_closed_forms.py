@@ -59,7 +59,7 @@ def test_health_is_bayes_rule_after_a_prior_that_time_has_blurred() -> None:
         likelihoods.append(outlier * health.OTHER_IF_FROZEN)
         gain = (spread + health.BIAS_WALK) / (spread + health.BIAS_WALK + 1)
         bias, spread = bias + gain * (whitened - bias), (1 - gain) * (spread + health.BIAS_WALK)
-        blurred = 1 - math.exp(-(health.KEEPS if number == 0 else 0.2) / health.KEEPS)
+        blurred = 1 - math.exp(-(health.MEAN_STATUS_TIME if number == 0 else 0.2) / health.MEAN_STATUS_TIME)
         held = posterior(held + blurred * (np.array(health.PRIOR) - held), np.array(likelihoods))
         health.judge(memory, stamps, whitened, 2, False, T0 + number * SECOND // 5)
         np.testing.assert_allclose(memory[BELIEF], held, rtol=1e-12)
@@ -94,7 +94,7 @@ def test_a_collapsed_bank_has_the_moments_of_its_mixture() -> None:
         state.bank[i, 0] = shares[i]
         spreads.append(hypothesis.covariance.copy())
     begin = state.copy()
-    bank.settle(state, settings)
+    bank.collapse_if_close(state, settings)
     assert state.stamps[PHASE] == RUNNING
     reference = collapse(Mixture(shares, errors, np.array(spreads)))
     np.testing.assert_allclose(difference(state, begin), reference.mean, atol=1e-8)

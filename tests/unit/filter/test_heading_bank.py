@@ -10,7 +10,9 @@ import pytest
 from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssVelocity, Measurement
-from fusiond.filter.heading_bank import normalise
+from fusiond.filter.heading_bank import collapse_if_close, normalise, weigh
+from fusiond.filter.observations.model import Observation
+from fusiond.filter.parameters import plan
 from fusiond.filter.state import CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
 from fusiond.maths.wgs84 import mat_ne
 from tests.conftest import needs_compiled
@@ -90,6 +92,44 @@ def test_one_wild_fix_decides_nothing() -> None:
     weights = fuse(config(), events, True).history.head.bank[:, 0]
     assert weights.max() < 0.3
     assert (weights > 0).sum() == 12
+
+
+@pytest.mark.parametrize(("m", "off"), [(1, 0.3), (2, 1.5), (3, 40.0), (3, 1e4)])
+def test_a_weight_takes_the_likelihood_with_a_share_of_outliers(m: int, off: float) -> None:
+    """(1 - share) N(d; 0, S) + share N(d; 0, 100 S), but for (2 pi)^(m/2); the farthest innovations count as 1000 squared
+    sigmas, so that no hypothesis vanishes by one."""
+    rng = np.random.default_rng(m)
+    state = FilterState(1)
+    state.covariance[:] = np.diag(rng.uniform(0.5, 2.0, state.size))
+    jacobian, variance, factor = rng.normal(size=(m, state.size)), rng.uniform(0.2, 1.0, m), 3.0
+    innovation, spread = off * rng.normal(size=m), np.zeros((3, 3))
+    spread[:m, :m] = jacobian @ state.covariance @ jacobian.T
+    whole = spread[:m, :m] + factor * np.diag(variance)
+    square = float(innovation @ np.linalg.solve(whole, innovation))
+    near = math.exp(-square / 2)
+    far = math.exp(-min(square, 1000.0) / 200) / 10.0**m
+    state.bank[4, 0] = 0.25
+    weigh(state, 4, Observation.of(innovation, jacobian, variance), factor, spread)
+    expected = 0.25 * (0.99 * near + 0.01 * far) / math.sqrt(np.linalg.det(whole))
+    assert state.bank[4, 0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_an_observation_that_is_none_weighs_nothing() -> None:
+    state = FilterState(1)
+    state.bank[0, 0] = 0.25
+    for spread, variance in ((np.full((3, 3), math.nan), 1.0), (np.zeros((3, 3)), 0.0), (-np.eye(3), 0.5)):
+        weigh(state, 0, Observation.of(np.ones(1), np.ones((1, state.size)), np.array([variance])), 1.0, spread)
+        assert state.bank[0, 0] == 0.25
+
+
+def test_a_bank_without_weight_does_not_settle() -> None:
+    state = FilterState(1)
+    state.stamps[PHASE] = CHOOSING
+    for weight in (0.0, math.nan):
+        state.bank[:, 0] = weight
+        with np.errstate(invalid="ignore"):
+            collapse_if_close(state, plan(config()))
+        assert state.stamps[PHASE] == CHOOSING
 
 
 def test_weights_sum_to_one_and_the_unlikely_go() -> None:

@@ -12,18 +12,21 @@ import pytest
 from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import Measurement
-from fusiond.filter.hot_start import BELIEVED_WEIGHT, DOUBTED_WEIGHT, Verdict, aged
+from fusiond.filter.hot_start import DOUBTED_WEIGHT, USED_WEIGHT, Verdict, aged
 from fusiond.filter.parameters import plan
 from fusiond.filter.state import (
     ALIGNING,
     CHOOSING,
     GYRO_BIAS,
     GYRO_BIAS_B,
+    HOT_START,
     PHASE,
+    RESET_REASON,
     RUNNING,
     STORED,
     WHEEL_SCALE,
     FilterState,
+    ResetReason,
     T,
 )
 from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, installation, to_text
@@ -114,7 +117,7 @@ def test_where_it_stood_it_has_a_state_at_once(compiled: bool) -> None:
         if event.source == "gps0.velocity" and fusion.estimate_at(event.t_ns).mode is Mode.NOMINAL:
             told.append((event.t_ns - events[0].t_ns) / SECOND)
     assert told[0] < 1.3  # the first fix after the 0.8 s of leveling
-    assert fusion.hot_start() is Verdict.BELIEVED
+    assert fusion.hot_start() is Verdict.USED
     error, sigma = off(fusion, truth)
     assert abs(error) < 3 * sigma < math.radians(15.0)
     estimate = fusion.estimate_at(int(fusion.history.head.stamps[T])).state
@@ -133,7 +136,7 @@ def test_it_can_be_stored_again_before_it_has_driven() -> None:
     again = fusion.to_store()
     assert again is not None and again.at_rest
     assert again.yaw == pytest.approx(stored().yaw, abs=math.radians(1.0))
-    assert hot(later(age_ns=2 * HOUR)[1], again).hot_start() is Verdict.BELIEVED
+    assert hot(later(age_ns=2 * HOUR)[1], again).hot_start() is Verdict.USED
 
 
 @needs_compiled
@@ -163,7 +166,8 @@ def test_a_wrong_heading_is_withdrawn_soon() -> None:
             wrong.append((second, error > 3 * estimate.sigma_yaw()))
             resets.append(fusion.estimate_at(event.t_ns).resets)
     assert max(second for second, is_wrong in wrong if is_wrong) < PULLS_AWAY_S + 1.5
-    assert (resets[0], resets[-1]) == (0, 1)  # what is told jumps
+    assert (resets[0], resets[-1]) == (0, 1)  # what is published jumps
+    assert fusion.history.head.stamps[RESET_REASON] == ResetReason.HEADING_DECIDED
     assert resets == sorted(resets)
 
 
@@ -191,12 +195,13 @@ def first_weight(events: list[Measurement], kept: StoredState) -> tuple[float, V
         fusion.take(event)
         if fusion.history.head.stamps[PHASE] == CHOOSING:
             break
-    return float(fusion.history.head.bank[STORED, 0]), fusion.hot_start()
+    head = fusion.history.head
+    return float(head.bank[STORED, 0]), Verdict(int(head.stamps[HOT_START]))
 
 
 def test_what_agrees_in_part_is_one_hypothesis_of_many() -> None:
     kept = stored()
-    assert first_weight(later()[1], kept) == (pytest.approx(BELIEVED_WEIGHT), Verdict.BELIEVED)
+    assert first_weight(later()[1], kept) == (pytest.approx(USED_WEIGHT), Verdict.USED)
     tilted = msgspec.structs.replace(kept, roll=kept.roll + math.radians(3.0))
     assert first_weight(later()[1], tilted) == (pytest.approx(DOUBTED_WEIGHT), Verdict.DOUBTED)
     moving = msgspec.structs.replace(kept, at_rest=False)
@@ -205,6 +210,12 @@ def test_what_agrees_in_part_is_one_hypothesis_of_many() -> None:
     vague = msgspec.structs.replace(kept, yaw_variance=1.0)
     assert first_weight(later()[1], vague) == (0.0, Verdict.VAGUE)
     assert hot(later()[1], tilted).estimate_at(stored().t_ns + HOUR + 2 * SECOND).state is None  # not told before it is sure
+
+
+def test_without_a_stored_state_there_is_no_verdict() -> None:
+    fusion = fuse(config(), later()[1])
+    assert fusion.history.head.stamps[HOT_START] == Verdict.NONE
+    assert fusion.hot_start() is Verdict.NONE
 
 
 def test_in_motion_now_it_is_one_hypothesis_of_many() -> None:

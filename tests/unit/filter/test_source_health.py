@@ -52,7 +52,7 @@ def test_bayes_by_hand() -> None:
     for k, (e, same) in enumerate([(0.5, False), (4.0, False), (4.2, True)]):
         t_ns = T0 + k * SECOND // 10
         health.judge(memory, stamps, np.array([e]), 1, same, t_ns)
-        blurred = 1 - math.exp(-(health.KEEPS if last is None else 0.1) / health.KEEPS)
+        blurred = 1 - math.exp(-(health.MEAN_STATUS_TIME if last is None else 0.1) / health.MEAN_STATUS_TIME)
         last = t_ns
         if gaussian(e * e, 1 + health.FIRST_BIAS_VARIANCE, 1) > gaussian((e - bias) ** 2, 1 + spread, 1):
             bias, spread = 0.0, health.FIRST_BIAS_VARIANCE
@@ -83,7 +83,7 @@ def test_absence_by_hand() -> None:
         assert sum(found.probabilities) == pytest.approx(1.0, rel=1e-12)
         assert found.probabilities[0] == pytest.approx(9 * found.probabilities[1], rel=1e-12)
     assert found.status == "absent"
-    assert "nothing of it" in found.reason
+    assert "not received" in found.reason
 
 
 @pytest.mark.parametrize("ratio", [0.25, 4.0])

@@ -17,13 +17,17 @@ from fusiond.filter.state import (
     ATTITUDE,
     GYRO_BIAS,
     MOUNT_ERROR,
+    PHASE,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
+    RUNNING,
     SCALE,
+    T_IMU,
     VELOCITY,
     VELOCITY_E,
     FilterState,
+    T,
 )
 from fusiond.filter.strapdown import COAST_ACCEL, COAST_TILT, COAST_TURN
 from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion, quaternion_exp, quaternion_multiply
@@ -254,7 +258,7 @@ def test_transition_against_finite_differences(kernel: AnyKernel, seed: int) -> 
 
 def test_coasting_against_finite_differences(compiled: bool) -> None:
     state = running_state(np.random.default_rng(4))
-    state.stamps[1] = T0 - 10 * SECOND  # the IMU is long silent
+    state.stamps[T_IMU] = T0 - 10 * SECOND  # the IMU is long silent
     state.nominal[3:6] *= 0.1  # so that turns, by which a velocity turns along, are little noise
     kernel = make_kernel(plan(config(imu=QUIET)), compiled)
 
@@ -295,7 +299,7 @@ def test_coasting_noise(compiled: bool) -> None:
     """From nothing, over a second: white acceleration, white tilt, and a white turn about the vertical by which the velocity
     turns along. All by their integrals."""
     state = Path(MUNICH, 10.0).state()
-    state.stamps[:2], state.stamps[9] = (T0, T0 - 10 * SECOND), 2
+    state.stamps[[T, T_IMU, PHASE]] = T0, T0 - 10 * SECOND, RUNNING
     make_kernel(plan(config()), compiled).predict(state, T0 + SECOND)
     up = state.nominal[:3] / np.linalg.norm(state.nominal[:3])
     sideways = np.cross(up, state.nominal[3:6])

@@ -48,10 +48,10 @@ from fusiond.filter.state import (
     RUNNING,
     SCATTER_FORCE,
     SCATTER_RATE,
-    T_ALIKE,
     T_IMU,
     T_LAST,
     T_REJECTED,
+    T_SAME_ERROR,
     T_START,
     T_STILL,
     VELOCITY_E,
@@ -299,7 +299,7 @@ def test_reset_after_a_long_rejection(kind: str) -> None:
     state.source_stamps[source, [T_LAST, T_REJECTED]] = T0 - 100 * MS
     wait = 5 * SECOND if kind == "position" else SUSPECT * 5 * SECOND
     for since, resets in ((wait, 1), (wait - 1, 0), (None, 0)):
-        state.source_stamps[source, T_ALIKE] = NEVER if since is None else T0 - since
+        state.source_stamps[source, T_SAME_ERROR] = NEVER if since is None else T0 - since
         fusion, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
         reason = ResetReason.SOURCE_RETURNED if resets else ResetReason.NONE
         assert reset_by(fusion) == (resets, reason, KINDS[kind] if resets else settings.sources()[0])
@@ -422,7 +422,7 @@ def kept(heading: float) -> StoredState:
 
 def test_a_hot_start_that_the_drive_contradicts() -> None:
     fusion = both_kernels(config(), sensed(departing(2.0, 7.0)), kept(0.5))
-    assert fusion.hot_start() is Verdict.BELIEVED
+    assert fusion.hot_start() is Verdict.USED
     assert reset_by(fusion)[:2] == (1, ResetReason.HEADING_DECIDED)
 
 
