@@ -146,7 +146,8 @@ class Bound:
             if number == IMU or (number == MODEL["wheel_speed"]) != (what == "wheel"):
                 continue
             seen = Observation(state.size)
-            assert MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source], seen)
+            is_seen = MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source], seen)
+            assert is_seen
             with_rate_noise(state, seen)
             p = updated(p, seen)
         return p

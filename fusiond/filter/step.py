@@ -68,6 +68,8 @@ def step(state: FilterState, row: Row, imu: Row | None, plan: Plan) -> None:
         initial_alignment.gather_motion(state, row, plan)
     elif state.stamps[PHASE] == CHOOSING:
         _choose(state, row, imu, plan)
+        if state.stamps[PHASE] == CHOOSING:
+            _guard_bank(state)
     else:
         coasted = coasts(state, t_ns, plan)
         advance(state, t_ns, imu, plan)
@@ -284,13 +286,38 @@ def hold(state: FilterState, values: Vector, t_ns: int) -> None:
 @compiled
 def guard(state: FilterState) -> None:
     """If the state is no longer finite, empty it and align again. Never expected; counted where it happens."""
+    if _is_finite(state):
+        return
+    _start_over(state)
+
+
+@compiled
+def _guard_bank(state: FilterState) -> None:
+    """Give up the hypotheses that are no longer finite; where none is left, align again."""
+    kept = 0
+    for i in range(HYPOTHESES):
+        hypothesis = state.hypothesis(i)
+        if state.bank[i, 0] > 0 and _is_finite(hypothesis):
+            kept += 1
+        else:
+            state.bank[i, 0] = 0.0
+    if kept == 0:
+        _start_over(state)
+
+
+@compiled
+def _is_finite(state: FilterState) -> bool:
     total = 0.0
     for i in range(len(state.nominal)):
         total += state.nominal[i]
     for i in range(state.size):
         total += state.covariance[i, i]
-    if math.isfinite(total):
-        return
+    return math.isfinite(total)
+
+
+@compiled
+def _start_over(state: FilterState) -> None:
+    """Empty the state, and count it."""
     resets, blown = int(state.stamps[RESETS]), int(state.stamps[BLOWN])
     state.clear()
     state.stamps[RESETS], state.stamps[BLOWN] = resets + 1, blown + 1

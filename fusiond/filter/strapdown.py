@@ -28,7 +28,7 @@ from fusiond.filter.state import (
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import square
-from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, skew, times
+from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, times
 from fusiond.maths.typed import Covariance, Matrix3, Vector3, compiled
 from fusiond.maths.wgs84 import EARTH_RATE, MU, gravity_e
 
@@ -38,8 +38,6 @@ COAST_TILT = 0.03  # rad/s/sqrt(Hz), about any axis: a car's body on its springs
 COAST_RATE = 0.5  # rad/s: the angular rate is not known any better then
 MAX_STEP = 0.05  # s: longer intervals are propagated in equal parts
 CORNER = slice(0, 9)  # position, velocity, attitude: the error states that the transition changes
-EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
-EARTH_RATE_SKEW = skew(EARTH_RATE_E)
 
 
 class ProcessNoise(NamedTuple):

@@ -1,4 +1,4 @@
-# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
+# Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 
 cdef double[4] PRIOR = [0.997, 0.001, 0.001, 0.001]
@@ -2033,6 +2033,8 @@ cdef void step_step(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil
         initial_alignment_gather_motion(state, row, plan)
     elif (state.stamps[9] == 3):
         step__choose(state, row, imu, plan)
+        if (state.stamps[9] == 3):
+            step__guard_bank(state)
     else:
         coasted = step_coasts(state, t_ns, plan)
         step_advance(state, t_ns, imu, plan)
@@ -2263,17 +2265,37 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
         a[(9 + i)] = _t2
 
 cdef void step_guard(State* state) noexcept nogil:
+    if step__is_finite(state):
+        return
+    step__start_over(state)
+
+cdef void step__guard_bank(State* state) noexcept nogil:
+    cdef int64_t kept
+    cdef int64_t i
+    cdef State hypothesis
+    kept = 0
+    for i in range(13):
+        hypothesis = hypothesis_of(state, i)
+        if ((state.bank[(i) * BLOCK + 0] > 0) and step__is_finite(&hypothesis)):
+            kept += 1
+        else:
+            state.bank[(i) * BLOCK + 0] = 0.0
+    if (kept == 0):
+        step__start_over(state)
+
+cdef bint step__is_finite(State* state) noexcept nogil:
     cdef double total
     cdef int64_t i
-    cdef int64_t resets
-    cdef int64_t blown
     total = 0.0
     for i in range(NOMINAL_SIZE):
         total += state.nominal[i]
     for i in range(n):
         total += state.covariance[(i) * n + i]
-    if isfinite(total):
-        return
+    return isfinite(total)
+
+cdef void step__start_over(State* state) noexcept nogil:
+    cdef int64_t resets
+    cdef int64_t blown
     resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
     clear_state(state)
     state.stamps[10], state.stamps[17] = (resets + 1), (blown + 1)

@@ -13,7 +13,7 @@ from fusiond.events import GnssVelocity, Measurement
 from fusiond.filter.heading_bank import collapse_if_close, normalise, weigh
 from fusiond.filter.observations.model import Observation
 from fusiond.filter.parameters import plan
-from fusiond.filter.state import CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
+from fusiond.filter.state import BLOWN, CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
 from fusiond.maths.wgs84 import mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.streams import PULLS_AWAY_S, SECOND, T0, Drive, bits, config, drive, fuse, measurements, ramp
@@ -56,6 +56,25 @@ def test_in_reverse_with_wheels_that_do_not_tell(seed: int) -> None:
     error, sigma = yaw_error(fuse(config(), measurements(truth, seed=seed + 1), True), truth)
     assert abs(error) < math.radians(5.0)
     assert abs(error) < 3 * sigma
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_hypotheses_that_are_not_finite_are_given_up(compiled: bool, whole: bool) -> None:
+    """The others go on; where none is left the filter aligns anew. Neither publishes what is not finite."""
+    truth = departing(2.0)
+    fusion, poisoned = Fusion(config(), compiled), False
+    head = fusion.history.head
+    with np.errstate(invalid="ignore"):
+        for event in measurements(truth):
+            if not poisoned and head.stamps[PHASE] == CHOOSING and event.t_ns > T0 + SECOND:
+                poisoned = True
+                head.bank[:: 1 if whole else 4, -1] = math.nan  # the last variance of each, or of every fourth
+            fusion.take(event)
+            state = fusion.estimate_at(int(head.stamps[T])).state
+            assert state is None or math.isfinite(sum(state.velocity_n) + state.covariance.sum())
+    assert poisoned
+    assert head.stamps[BLOWN] == whole
+    assert head.stamps[PHASE] == RUNNING
 
 
 def test_at_rest_it_waits_and_then_runs(compiled: bool) -> None:
