@@ -1,6 +1,6 @@
 """The types of functions that run compiled as well as interpreted, and their mark.
 
-A function marked `@compiled` is plain Python on NumPy arrays. `tools/translate_kernel.py` makes the compiled kernel's source
+A function marked `@compiled` is plain Python on NumPy arrays. `tools/translate_kernel` makes the compiled kernel's source
 of it, by the types of its parameters; what may stand in it is said there.
 """
 

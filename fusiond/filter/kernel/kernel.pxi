@@ -1,6 +1,6 @@
 """The compiled kernel for `n` error states; included by the files that say how many that is.
 
-The filter's functions are translated from Python (functions.pxi, made by tools/translate_kernel.py). This class binds them to
+The filter's functions are translated from Python (functions.pxi, made by tools/translate_kernel). This class binds them to
 memory and runs them over a table of events without the interpreter. fusiond.filter.kernel.interpreted.Kernel is its counterpart.
 It is built without fused multiply-add and calls nothing of the C library that is not exact, so it gives the same bits on every
 processor, and those of the interpreter.

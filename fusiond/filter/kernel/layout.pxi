@@ -1,4 +1,4 @@
-# Made by tools/translate_kernel.py from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
+# Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 cdef enum:
     NOMINAL_SIZE = 28

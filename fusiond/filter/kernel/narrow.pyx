@@ -1,5 +1,5 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-# Made by tools/translate_kernel.py: not to be edited.
+# Made by tools/translate_kernel: not to be edited.
 """The compiled hot loop (kernel.pxi) for the ordinary state: see there."""
 
 cdef enum:

@@ -22,7 +22,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "app/live/test_live_parts.py": "parts of the live daemon, of adapters and configuration",
     "filter/observations/test_observations.py": "every observation model of the table",
     "filter/test_closed_forms.py": "decisions of the filter against the closed forms of tests/oracles",
-    "filter/kernel/test_generated.py": "what tools/translate_kernel.py made, against what it would make",
+    "filter/kernel/test_generated.py": "what tools/translate_kernel made, against what it would make",
     "timeline/test_clock_jumps.py": "timeline/clock.py where clocks jump, stray, stall and reboot",
 }
 FILES = sorted(path for path in UNIT.rglob("test_*.py") if path.parent.name != "project")

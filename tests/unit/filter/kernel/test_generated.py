@@ -1,4 +1,4 @@
-"""The generated part of the compiled kernel (layout.pxi, functions.pxi): it is what tools/translate_kernel.py makes of the
+"""The generated part of the compiled kernel (layout.pxi, functions.pxi): it is what tools/translate_kernel makes of the
 Python sources as they are now, and holds every function that is marked for it."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def marked(mark: str) -> Iterator[tuple[str, str]]:
 
 
 def test_the_committed_files_are_current() -> None:
-    command = [sys.executable, str(ROOT / "tools" / "translate_kernel.py"), "--check"]
+    command = [sys.executable, "-m", "tools.translate_kernel", "--check"]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (0, "")
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tools import translate_kernel
-from tools.translate_kernel import UntranslatableError
+from tools.translate_kernel import __main__ as command
+from tools.translate_kernel import files, functions
+from tools.translate_kernel.functions import UntranslatableError
 
 HEAD = """\
 import math
@@ -38,8 +39,8 @@ def translate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Translate:
         (tmp_path / "small.py").write_text(text)
         monkeypatch.syspath_prepend(str(tmp_path))
         monkeypatch.delitem(sys.modules, "small", raising=False)
-        monkeypatch.setattr(translate_kernel, "modules", lambda: iter([("small", text)]))
-        return translate_kernel.bodies().partition("small\n\n")[2].strip()
+        monkeypatch.setattr(functions, "modules", lambda: iter([("small", text)]))
+        return files.bodies().partition("small\n\n")[2].strip()
 
     yield translated
     sys.modules.pop("small", None)
@@ -408,15 +409,15 @@ def test_types_that_have_no_translation(translate: Translate, signature: str, ty
 def test_check_tells_which_file_is_not_current(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(translate_kernel, "ROOT", tmp_path)
+    monkeypatch.setattr(command, "ROOT", tmp_path)
     made = {tmp_path / "layout.pxi": "sizes", tmp_path / "functions.pxi": "bodies"}
-    monkeypatch.setattr(translate_kernel, "made", lambda: made)
-    assert translate_kernel.main(["--check"]) == 1  # neither is there
+    monkeypatch.setattr(command, "made", lambda: made)
+    assert command.main(["--check"]) == 1  # neither is there
     assert list(tmp_path.iterdir()) == []
-    assert translate_kernel.main([]) == 0
+    assert command.main([]) == 0
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"layout.pxi": "sizes", "functions.pxi": "bodies"}
     capsys.readouterr()
-    assert translate_kernel.main(["--check"]) == 0
+    assert command.main(["--check"]) == 0
     (tmp_path / "functions.pxi").write_text("edited")
-    assert translate_kernel.main(["--check"]) == 1
-    assert capsys.readouterr().err == "functions.pxi is not current: run python tools/translate_kernel.py\n"
+    assert command.main(["--check"]) == 1
+    assert capsys.readouterr().err == "functions.pxi is not current: run python -m tools.translate_kernel\n"

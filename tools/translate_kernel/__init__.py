@@ -1,0 +1,1 @@
+"""Makes the compiled kernel out of the filter: see __main__.py."""
