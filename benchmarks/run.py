@@ -121,13 +121,13 @@ def running(imu_hz: int, seconds: float, compiled: bool = True, **filter_keys: f
     for k in range(round(seconds * 1000)):
         t_ns = T0 + k * SECOND // 1000
         if k % (1000 // imu_hz) == 0 or (imu_hz == 400 and k % 5 in (0, 2)):
-            fusion.take(event(t_ns, "imu0", k))
+            fusion.fuse(event(t_ns, "imu0", k))
         if k % 10 == 3:
             for wheel in WHEELS:
-                fusion.take(event(t_ns, wheel, k))
+                fusion.fuse(event(t_ns, wheel, k))
         if k % 100 == 7 and t_ns < T0 + round((seconds - 1) * SECOND):
-            fusion.take(event(t_ns, "gps0.position", k))
-            fusion.take(event(t_ns, "gps0.velocity", k))
+            fusion.fuse(event(t_ns, "gps0.position", k))
+            fusion.fuse(event(t_ns, "gps0.velocity", k))
     return fusion, fusion.history.applied_ns
 
 
@@ -196,8 +196,8 @@ def rewind_lines(predict: Callable[[], object], repeats: int) -> list[Line]:
                 for i in range(5):  # a few at one instant: each is an event more for those after it
                     late = event(now - late_ms * 1_000_000 + i, "gps0.position", 10**6 + i)
                     before, begin = fusion.history.rerun, time.process_time_ns()
-                    fusion.take(late)
-                    fusion.history.catch_up()
+                    fusion.fuse(late)
+                    fusion.history.apply_rows()
                     times.append((time.process_time_ns() - begin) / 1000)
                     rows.append(fusion.history.rerun - before)
                     units.append(median_us(predict, 1, 200))

@@ -24,7 +24,7 @@ import numpy as np
 
 from fusiond.app.client import Client
 from fusiond.config.schema import Zenoh
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import (
     EventMessage,
@@ -45,13 +45,13 @@ KINDS: tuple[type[Message], ...] = (StateMessage, HealthMessage, EventMessage)
 
 def state(vehicle: str, t_ns: int) -> StateMessage:
     three = (0.1234567891234, -2.3456789, 0.012345678)
-    told = StateEstimate(
+    told = SolutionState(
         latitude=0.8401234, longitude=0.2012345, height=112.3, velocity_n=three, quaternion_nb=(0.98, 0.1, 0.1, 0.1),
         angular_rate_b=three, acceleration_b=three, gyro_bias=three, accel_bias=three, wheel_scale=0.012, mount=(0.01, 0.02),
         covariance=np.eye(9) * 0.123456789, sigma_gyro_bias=three, sigma_accel_bias=three, sigma_wheel_scale=1e-3,
         sigma_mount=(1e-3, 2e-3),
     )  # fmt: skip
-    return state_message(Estimate(t_ns, Mode.NOMINAL, 2_500_000, 0, told), vehicle, COUNTS)
+    return state_message(Solution(t_ns, Mode.NOMINAL, 2_500_000, 0, told), vehicle, COUNTS)
 
 
 def health(vehicle: str, t_ns: int) -> HealthMessage:

@@ -26,7 +26,7 @@ from fusiond.app.replay.replay import Replay, Wants
 from fusiond.app.replay.summary import Summary
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config
-from fusiond.estimator.fusion import state_estimate
+from fusiond.estimator.fusion import solution_state
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import CHOOSING, LAST_SPEED, PHASE
 from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMessage
@@ -265,7 +265,7 @@ def draw_bank() -> None:
         if message.state:
             return message.state.yaw_deg % 360, message.state.sigma_yaw_deg
         left = np.flatnonzero(head.bank[:, 0]) if head.stamps[PHASE] == CHOOSING else []
-        yaws = (math.degrees(state_estimate(head.hypothesis(i), kernel).euler()[2]) % 360 for i in left)
+        yaws = (math.degrees(solution_state(head.hypothesis(i), kernel).euler()[2]) % 360 for i in left)
         return (math.nan, *(number for i, yaw in zip(left, yaws, strict=True) for number in (float(head.bank[i, 0]), yaw)))
 
     second, looks, truth = seen(REVERSES, look)
@@ -295,7 +295,7 @@ def draw_slip() -> None:
         head, history = run.fusion.history.head, run.fusion.history
         wheel = float(head.memory[history.index["rear_left"], LAST_SPEED])
         speed = math.hypot(*message.state.velocity_ned_mps[:2]) if message.state else math.nan
-        return speed, wheel, *run.fusion.beliefs(message.t_ns)["rear_left"].probabilities
+        return speed, wheel, *run.fusion.health(message.t_ns)["rear_left"].probabilities
 
     second, looks, truth = seen(SLIPS, look)
     speed, wheel, *beliefs = np.array(looks).T

@@ -73,7 +73,7 @@ def watched(
     errors: list[float] = []
 
     def look(t: float, k: int) -> None:
-        for source, belief in fusion.beliefs(T0 + nanoseconds(t)).items():
+        for source, belief in fusion.health(T0 + nanoseconds(t)).items():
             statuses[source].append(belief.status)
         errors.append(float(np.hypot(*(world.mat_ne[k] @ error(fusion.history.head, world, k)[POSITION])[:2])))
 

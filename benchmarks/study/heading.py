@@ -82,7 +82,7 @@ def one(case: Case, heading_deg: float, seed: list[int]) -> Start:
 
     def look(t: float, k: int) -> None:
         i = next(index)
-        answer = fusion.estimate_at(T0 + nanoseconds(t)).state
+        answer = fusion.solution_at(T0 + nanoseconds(t)).state
         if answer is not None:
             truth = np.arctan2(world.mat_nb[k, 1, 0], world.mat_nb[k, 0, 0])
             errors[i] = abs((answer.euler()[2] - truth + np.pi) % (2 * np.pi) - np.pi)

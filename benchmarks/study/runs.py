@@ -159,7 +159,7 @@ def drive(
     due = T0 + nanoseconds(t) if t is not None else -1
     imu = next(iter(fusion.config.imu))
     for measurement in measurements:
-        fusion.take(measurement)
+        fusion.fuse(measurement)
         if ledger is not None and measurement.source == imu and measurement.sequence % COLLECT_EVERY == 0:
             ledger.collect()
         if t is not None and measurement.source == imu and measurement.t_ns >= due:

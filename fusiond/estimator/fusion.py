@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from fusiond.config.schema import Config, Imu
 from fusiond.estimator.history import History
-from fusiond.estimator.solution import COVARIANCE_SIZE, Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import COVARIANCE_SIZE, Mode, Solution, SolutionState
 from fusiond.events import ImuSample, Invalid, Measurement, Received, Vector3
 from fusiond.filter.hot_start import leading, leads
 from fusiond.filter.kernel.interpreted import AnyKernel
@@ -84,15 +84,15 @@ class Fusion:
         }
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 
-    def receive(self, received: Received) -> Receipt | None:
+    def feed(self, received: Received) -> Receipt | None:
         """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only.
 
         The source must be one of the configuration's; ValueError otherwise.
         """
         measurement = self.clock.align(received)
-        return None if measurement is None else self.take(measurement)
+        return None if measurement is None else self.fuse(measurement)
 
-    def take(self, measurement: Measurement) -> Receipt:
+    def fuse(self, measurement: Measurement) -> Receipt:
         """Fuse an event that is aligned already."""
         history, source = self.history, self.history.index.get(measurement.source)
         if source is None:
@@ -105,7 +105,7 @@ class Fusion:
             return Receipt(measurement, history, history.count(source, Outcome.INVALID), reason)
         return Receipt(measurement, history, history.offer(source, measurement, values))
 
-    def estimate_at(self, t_ns: int) -> Estimate:
+    def solution_at(self, t_ns: int) -> Solution:
         """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
         instant before the head's gives the head itself."""
         self._carried.copy_from(self.history.head)
@@ -113,7 +113,7 @@ class Fusion:
         self.history.kernel.predict(state, t_ns)
         return self._estimate(state, t_ns)
 
-    def settled(self) -> Estimate:
+    def settled(self) -> Solution:
         """The estimate at the horizon, which no late event can change any more."""
         state = self._published(self.history.settled())
         return self._estimate(state, int(state.stamps[T]))
@@ -140,7 +140,7 @@ class Fusion:
         """Counts of outcomes over all sources."""
         return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
 
-    def beliefs(self, t_ns: int) -> dict[str, Belief]:
+    def health(self, t_ns: int) -> dict[str, Belief]:
         """What each source is held to be at an instant (THEORY D1, D2)."""
         head = self.history.head
         start = int(head.stamps[T_START])
@@ -164,19 +164,19 @@ class Fusion:
         """What is published of a state: while a bank is sure of a stored heading, the hypothesis of that."""
         return leading(state) if leads(state, self.plan) else state
 
-    def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
+    def _estimate(self, state: FilterState, t_ns: int) -> Solution:
         stamps, resets = state.stamps, int(state.stamps[RESETS])
         age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
         if stamps[PHASE] != RUNNING:
-            return Estimate(t_ns, Mode.ALIGNING, age, resets, None)
-        answer = state_estimate(state, self.history.kernel)
+            return Solution(t_ns, Mode.ALIGNING, age, resets, None)
+        answer = solution_state(state, self.history.kernel)
         north, east, _ = answer.sigma_position_n()
         mode = Mode.NOMINAL
         if math.hypot(north, east) > self.plan.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
             mode = Mode.LOST
         elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.plan.filter.position_timeout_s):
             mode = Mode.DEAD_RECKONING
-        return Estimate(t_ns, mode, age, resets, answer)
+        return Solution(t_ns, mode, age, resets, answer)
 
 
 def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
@@ -186,7 +186,7 @@ def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
     return sample.specific_force_b + sample.angular_rate_b
 
 
-def state_estimate(state: FilterState, kernel: AnyKernel) -> StateEstimate:
+def solution_state(state: FilterState, kernel: AnyKernel) -> SolutionState:
     """A running filter state in north-east-down, as it is published."""
     x, auxiliary = state.nominal, state.auxiliary
     numbers = kernel.answer(x, state.covariance)
@@ -194,7 +194,7 @@ def state_estimate(state: FilterState, kernel: AnyKernel) -> StateEstimate:
     rate, force = auxiliary[RATE_B].tolist(), auxiliary[FORCE_B].tolist()
     gyro_bias, accel_bias = nominal[GYRO_BIAS_B], nominal[ACCEL_BIAS_B]
     sigma = [math.sqrt(max(variance, 0.0)) for variance in state.covariance.diagonal().tolist()]
-    return StateEstimate(
+    return SolutionState(
         latitude=told[0],
         longitude=told[1],
         height=told[2],

@@ -60,19 +60,19 @@ class History:
     @property
     def head(self) -> FilterState:
         """The state after every event up to `applied_ns`. The same object ever: ask again after an event."""
-        self.catch_up()
+        self.apply_rows()
         return self._head
 
     @property
     def rows(self) -> Rows:
         """The live rows, oldest first."""
-        self.catch_up()
+        self.apply_rows()
         return self._table[self._begin : self._end]
 
     @property
     def counts(self) -> NDArray[np.int64]:
         """Number of events (sources, outcomes), by the last word on each. The same array ever: ask again after an event."""
-        self.catch_up()
+        self.apply_rows()
         return self._counts
 
     def offer(self, source: int, measurement: Measurement, values: tuple[float, ...]) -> Outcome | None:
@@ -107,7 +107,7 @@ class History:
     def outcome(self, measurement: Measurement) -> Outcome:
         """What became of an event, by now. LookupError where it is not kept any more."""
         source, sequence = self.index[measurement.source], measurement.sequence
-        self.catch_up()
+        self.apply_rows()
         place = self.kernel.place(self._begin, self._end, measurement.t_ns, source, sequence)
         if place < 0:
             return Outcome(self._table["outcome"][self._begin + ~place])
@@ -125,7 +125,7 @@ class History:
         self.rerun += before - self._applied
         self._rewound = True
 
-    def catch_up(self) -> None:
+    def apply_rows(self) -> None:
         """Apply the rows up to `applied_ns`. Whoever looks at the state, the rows or the counts has this done."""
         if not self._behind:
             return
@@ -158,7 +158,7 @@ class History:
 
     def _forget(self) -> None:
         """Drop the rows and snapshots that no event inside the horizon can need. When this is done changes no result."""
-        self.catch_up()
+        self.apply_rows()
         self._until_forgetting = FORGET_EVERY
         gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
         self._begin += gone

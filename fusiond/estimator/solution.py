@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.events import Vector3
 from fusiond.maths.portable import asin, atan2
 
-# Blocks of `StateEstimate.covariance`
+# Blocks of `SolutionState.covariance`
 POSITION = slice(0, 3)  # m, north-east-down
 VELOCITY = slice(3, 6)  # m/s, north-east-down
 ATTITUDE = slice(6, 9)  # rad, small rotation about north, east, down
@@ -29,7 +29,7 @@ class Mode(enum.StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StateEstimate:
+class SolutionState:
     """Nominal state of the filter and its uncertainty; position and velocity are those of the IMU.
 
     The covariance is copied and made read-only. Raises ValueError where its shape is not (9, 9).
@@ -86,14 +86,14 @@ class StateEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class Solution:
     """The filter's answer at `t_ns`; `state` is None while there is none (aligning, or lost beyond use)."""
 
     t_ns: int  # the instant it is valid for
     mode: Mode
     age_ns: int | None  # t_ns less the stamp of the last IMU sample behind it; None before the first sample
     resets: int  # how often the state was reset (jumped)
-    state: StateEstimate | None
+    state: SolutionState | None
 
 
 def _half_open(angle: float) -> float:

@@ -157,7 +157,7 @@ def fuse(configuration: Config, events: Iterable[Measurement], compiled: bool | 
     """A filter that took the events in the order given."""
     fusion = Fusion(configuration, compiled)
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
     return fusion
 
 

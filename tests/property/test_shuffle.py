@@ -123,7 +123,7 @@ def check(case: Case, compiled: bool) -> None:
     in_order = fuse(settings_, prefix + events, compiled)
     shuffled = Fusion(settings_, compiled)
     for number, event in enumerate(prefix + arrival(events, case)):
-        shuffled.take(event)
+        shuffled.fuse(event)
         if number % case["look_every"] == 0:
             assert shuffled.history.head.stamps[T] <= shuffled.history.applied_ns
     assert in_order.history.head.stamps[PHASE] == RUNNING or not case["heading"]
