@@ -25,7 +25,8 @@ import zenoh
 from benchmarks.latency import configuration, free_port, process, turn_wheels
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.live.serve import serve
-from fusiond.config.schema import Config, Mcap
+from fusiond.config.outputs import Mcap
+from fusiond.config.schema import Config
 from fusiond.messages.latency import RecentLatencies
 
 QUIET, READ, STOPPED, FULL_DISKS = "quiet", "a subscriber", "the subscriber stopped", "disks full"

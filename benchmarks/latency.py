@@ -45,7 +45,8 @@ from fusiond.app.client import Client
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.live.serve import serve
 from fusiond.config import load as config
-from fusiond.config.schema import Config, Zenoh
+from fusiond.config.outputs import Zenoh
+from fusiond.config.schema import Config
 from fusiond.messages.types import StateMessage
 from fusiond_adapters.zenoh.session import open_session
 

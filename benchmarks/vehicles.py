@@ -23,7 +23,7 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 
 from fusiond.app.client import Client
-from fusiond.config.schema import Zenoh
+from fusiond.config.outputs import Zenoh
 from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import (

@@ -20,7 +20,7 @@ COVARIANCE_SIZE = 9
 
 
 class Mode(enum.StrEnum):
-    """How far the solution can be trusted."""
+    """How far the state can be trusted."""
 
     ALIGNING = "aligning"  # no state yet
     NOMINAL = "nominal"  # position is being fixed

@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from fusiond.config.schema import Encoding
+from fusiond.config.outputs import Encoding
 from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.codec import decode, encode
 from fusiond.messages.csv import csv_row
