@@ -469,7 +469,7 @@ class Config(Section, frozen=True, kw_only=True):
         return Path(self.directory) / name
 
     def sensors(self, **by: str) -> Iterator[ConfiguredSensor]:
-        """Every sensor, by kind in the order of the tables above. `link="NAME"` or `bus="NAME"` selects those of one input."""
+        """Every sensor, by kind in the order of the tables above. `link="NAME"` or `bus="NAME"` selects one input."""
         for table in sensor_tables():
             named: dict[str, Sensor] = getattr(self, table)
             for name, section in named.items():

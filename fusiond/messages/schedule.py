@@ -39,7 +39,7 @@ from fusiond.messages.types import (
     SourceStatus,
     StateMessage,
 )
-from fusiond.timeline.clock import ClockReport
+from fusiond.timeline.aligner import ClockReport
 
 SECOND = 1_000_000_000  # ns
 RATE_DENOMINATOR = 1_000_000  # a rate is taken as a fraction with at most this, so that ticks never drift
