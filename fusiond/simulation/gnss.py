@@ -60,7 +60,7 @@ def measure(
     t: Array,
     randoms: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> Fixes:
-    """The fixes that tell of the times `t` (N,) [s]; the generators are those of white, drifting and velocity noise."""
+    """The fixes of the instants `t` (N,) [s]. The generators are those of white, drifting and velocity noise."""
     gnss = scenario.gnss
     place, _ = antenna(trajectory, gnss, t)
     velocity = smoothed_velocity(trajectory, gnss, t)

@@ -62,8 +62,8 @@ def measure(
         held = np.flatnonzero(within(t, [(stuck.start_s, stuck.stop_s)]))
         column[held] = column[held[:1]]
     low, high = (0, RAW_MAX_UNSIGNED) if wheels.unsigned else (-RAW_MAX_SIGNED, RAW_MAX_SIGNED)
-    told = np.abs(speeds) if wheels.unsigned else speeds
-    raw = np.clip(np.rint(told * 3.6 / wheels.resolution_kmh), low, high).astype(np.int64)
+    signal = np.abs(speeds) if wheels.unsigned else speeds
+    raw = np.clip(np.rint(signal * 3.6 / wheels.resolution_kmh), low, high).astype(np.int64)
     fault = within(t, wheels.fault_s)
     raw[fault] = RUBBISH if wheels.unsigned else RAW_MAX_SIGNED
     return raw, fault

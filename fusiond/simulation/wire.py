@@ -139,7 +139,7 @@ class Telemetry:
     t_receive_us: Stamps
     counter: Stamps
     boot_ms: Stamps
-    row: Stamps  # of the truth that it tells
+    instant: Stamps  # index of the truth that it reports
 
 
 @dataclass(frozen=True, slots=True)
