@@ -90,7 +90,7 @@ def smoothed_velocity(trajectory: Trajectory, gnss: Gnss, t: Array) -> Array:
 
 
 def last_before(t: Array, frozen: Mask) -> Integers:
-    """Indices (N,): each its own, while frozen that of the last one before."""
+    """Index (N,) of the fix that each message repeats: its own, but that of the last one before while frozen."""
     own = np.where(frozen, 0, np.arange(len(t)))
     return np.maximum.accumulate(own)
 

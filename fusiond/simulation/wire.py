@@ -125,7 +125,7 @@ class TimeMessages:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeats:
-    """HEARTBEAT, which makes no event."""
+    """HEARTBEAT; it gives no event."""
 
     t_receive_us: Stamps
     counter: Stamps
@@ -133,7 +133,7 @@ class Heartbeats:
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """One of the messages that an autopilot sends besides, of no use to the filter."""
+    """Another message of the autopilot, which the filter does not use."""
 
     message: str
     t_receive_us: Stamps

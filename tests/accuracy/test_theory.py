@@ -1,4 +1,4 @@
-"""Honesty by Monte Carlo: the errors of many runs against the covariance that the filter claims for them."""
+"""Consistency by Monte Carlo: the errors of many runs against the covariance that the filter claims."""
 
 from __future__ import annotations
 
