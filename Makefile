@@ -1,10 +1,10 @@
-# make demo    fuse a bundled drive, and explain the result (out/demo)
+# make demo    fuse a bundled drive and explain the result (out/demo)
 # make test    lint, types, tests
-# make study   the long studies; make bench the benchmarks; make soak an hour of full load, as fast as it goes
+# make study   the long studies; make bench the benchmarks; make soak an hour of full load, as fast as possible
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
 # make clean   remove what was made
-# All set-up is done as needed, in a virtual environment of its own (.venv). PYTHON chooses the interpreter, 3.11 or later.
+# Everything needed is set up in a virtual environment (.venv). PYTHON selects the interpreter, 3.11 or later.
 
 PYTHON ?= python3
 VENV := .venv
@@ -38,7 +38,7 @@ bench: $(READY)
 soak: $(READY)
 	$(BIN)/python -m benchmarks.soak
 
-# The bundled drive: the simulator's, packed so that the same scenario gives the same bytes.
+# The bundled drive, from the simulator; packed so that the same scenario gives the same bytes.
 demo-data: $(READY)
 	$(BIN)/fusiond simulate --config configs/simulate-demo.toml --out $(DEMO)
 	gzip -9nf $(DEMO)/drive.tlog $(DEMO)/drive.log $(DEMO)/truth.csv
@@ -46,7 +46,7 @@ demo-data: $(READY)
 deb:
 	PYTHON=$(PYTHON) packaging/deb.sh
 
-# With DESTDIR the files are laid out there, and nothing is set up.
+# With DESTDIR the files are only installed there: no user is made and no unit reloaded.
 install:
 	PYTHON=$(PYTHON) packaging/stage.sh "$(DESTDIR)"
 	$(if $(DESTDIR),,packaging/postinst configure)
@@ -64,7 +64,7 @@ $(READY): pyproject.toml setup.py $(wildcard fusiond/filter/kernel/*.px[ix])
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
-# mypy looks for fusiond_adapters by its import name, which is not its folder's.
+# mypy looks for fusiond_adapters by its import name, which is not the name of its folder.
 $(TYPING):
 	mkdir -p $(@D)
 	ln -sfn ../../adapters $@

@@ -1,4 +1,4 @@
-"""Builds the compiled kernel in its two widths; all else is in pyproject.toml. Without a compiler it is left out."""
+"""Builds the compiled kernel in two widths, if there is a compiler. Everything else is in pyproject.toml."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from setuptools import Extension, setup
 
 KERNEL = Path("fusiond/filter/kernel")
 
-# No fused multiply-add: the results are to be the same bits on every processor.
+# No fused multiply-add, so that the results have the same bits on every processor.
 WIDTHS = [
     Extension(
         f"fusiond.filter.kernel.{name}",
@@ -20,6 +20,6 @@ WIDTHS = [
 
 modules = cythonize(WIDTHS)
 for module in modules:
-    module.optional = True  # a failed build leaves the kernel to the interpreter (cythonize drops the original's flag)
+    module.optional = True  # without a build the NumPy kernel serves (cythonize drops the flag of the original)
 
 setup(ext_modules=modules)

@@ -1,10 +1,10 @@
-"""Whether a consumer in trouble is felt by the filter: latency from receipt to fused, phase by phase, in one run.
+"""Whether a consumer in trouble delays the filter: latency from receipt to fused, phase by phase, in one run.
 
     python -m benchmarks.isolation [--seconds 8] [--out out/isolation]
 
-The load is that of benchmarks.latency, with MCAP written besides. The phases: nobody listens; a subscriber in another
-process; the same, stopped (SIGSTOP) with its connection open; no file of the black box and of MCAP can grow (RLIMIT_FSIZE);
-a router that was connected to dies; it is back; quiet again. Figures are ratios to the first phase.
+The load is that of benchmarks.latency, and MCAP files are written too. The phases: no subscriber; a subscriber in another
+process; the same subscriber stopped (SIGSTOP) with its connection open; no file of the black box or of MCAP can grow
+(RLIMIT_FSIZE); the connected router dies; it is back; no subscriber again. Figures are ratios to the first phase.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ import zenoh
 from benchmarks.latency import configuration, free_port, process, turn_wheels
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.live.serve import serve
-from fusiond.config.schema import Config, Mcap
+from fusiond.config.outputs import Mcap
+from fusiond.config.schema import Config
 from fusiond.messages.latency import RecentLatencies
 
 QUIET, READ, STOPPED, FULL_DISKS = "quiet", "a subscriber", "the subscriber stopped", "disks full"
@@ -52,7 +53,7 @@ def settings(folder: Path, udp: int, tcp: int, router_port: int) -> Config:
 
 
 class Watch:
-    """Latencies of the phase that is on: takes the place of the daemon's own."""
+    """Latencies of the present phase, in place of the daemon's own."""
 
     def __init__(self, inside: Callable[[int], None]) -> None:
         self.latest = RecentLatencies()
@@ -107,7 +108,7 @@ async def measure(folder: Path, seconds: float) -> str:
 
 
 async def during(watch: Watch, seconds: float) -> tuple[float, float]:
-    """p50 and p99 of a phase [ms], after half a second of settling."""
+    """p50 and p99 of a phase [ms], after half a second of transition."""
     await asyncio.sleep(0.5)
     watch.latest = RecentLatencies()
     await asyncio.sleep(seconds - 0.5)

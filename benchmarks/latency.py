@@ -1,18 +1,17 @@
-"""How long a publication takes to reach a subscriber in another process, and what the daemon's CPU time goes into.
+"""The time from a publication to a subscriber in another process, and where the daemon's CPU time goes.
 
     python -m benchmarks.latency [--seconds 30] [--runs 5] [--as-installed] [--by-clock] [--out out/latency]
 
-Load: IMU at 400 Hz, GNSS at 10 Hz and 200 ms late, both as MAVLink over UDP from a process of their own; four wheels at
-100 Hz in one CAN frame on python-can's virtual bus; 100 publications a second over Zenoh, with the black box running.
-The reference, named in the same run: a process that does nothing but put as many bytes at the same rate to the same kind
-of reader, the autopilot's process sending as before. It, too, is measured from the instant at which a put was due.
-What a host takes from its guests' processors (steal) is in all figures, and they follow it. It is told for each run, and
-a second row has what arrived while the host took nothing: from 250 ms before the instant of the publication to 250 ms
-after its arrival the count of steal, which moves each time another 10 ms have come together, stood still.
-A publication waits for the next inertial sample (`publish.on_imu`), but not with --by-clock, as is the default of the
-configuration: then the sample is up to 2.5 ms old at the instant of the publication, by a phase that chance decides anew
-in each run. With --as-installed the daemon has the priority and the timers that systemd/fusiond.service gives it; the
-other processes never have.
+Load: IMU at 400 Hz, GNSS at 10 Hz and 200 ms late, both as MAVLink over UDP from a separate process; four wheels at 100 Hz
+in one CAN frame on python-can's virtual bus; 100 publications a second over Zenoh, with the black box running.
+Reference, in the same run: a process that only puts the same number of bytes at the same rate to the same kind of reader,
+while the autopilot's process sends as before. It is measured from the instant at which a put was due, too.
+On a virtual machine the processor time that the host takes (steal) affects all figures. It is printed for each run, and a
+second row has only the arrivals that it did not disturb: the steal counter, which counts units of 10 ms, did not change
+from 250 ms before the publication to 250 ms after the arrival.
+A publication waits for the next inertial sample (`publish.on_imu`). With --by-clock it does not, as by default in the
+configuration: then the sample is up to 2.5 ms old, with a phase that is random in each run. With --as-installed the daemon
+has the priority and the timer slack of systemd/fusiond.service; the other processes never have.
 """
 
 from __future__ import annotations
@@ -45,22 +44,24 @@ from fusiond.app.client import Client
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.live.serve import serve
 from fusiond.config import load as config
-from fusiond.config.schema import Config, Zenoh
+from fusiond.config.outputs import Zenoh
+from fusiond.config.schema import Config
 from fusiond.messages.types import StateMessage
+from fusiond.units import MILLISECOND, SECOND
 from fusiond_adapters.zenoh.session import open_session
 
 IMU_HZ, GNSS_HZ, CAN_HZ, PUBLISH_HZ = 400, 10, 100, 100
 GNSS_LATE_US = 200_000
-NICE, TIMER_SLACK_NS = -5, 1000  # of systemd/fusiond.service
+NICE, TIMER_SLACK_NS = -5, 1000  # as in systemd/fusiond.service
 USUAL_SLACK_NS = 50_000  # Linux's
 PR_SET_TIMERSLACK = 29  # prctl(2)
-SETTLE = 200  # first publications that are left out
-PACKED_S = 300.0  # so much is packed beforehand
+WARM_UP = 200  # first publications, which are left out
+MAX_PACKED_S = 300.0  # a run up to this long is packed before it is sent
 STATE_BYTES = 1900  # of a state in JSON
 REFERENCE_KEY = "benchmark/reference"
 CHANNEL = "latency"
-LOOK_S = 0.02  # between looks at what the host took
-APART_NS = 250_000_000  # undisturbed for so long before and after
+LOOK_S = 0.02  # between readings of the steal counter
+APART_NS = 250 * MILLISECOND  # without steal for this long before and after
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 SIGNALS = "\n".join(f' SG_ {name} : {16 * i}|16@1+ (0.01,0) [0|0] "km/h" Vector__XXX' for i, name in enumerate(WHEELS))
 DBC = f'VERSION ""\nBU_: ECU\nBO_ 256 WHEELS: 8 ECU\n{SIGNALS}\n'
@@ -117,11 +118,11 @@ def every(hz: int, seconds: float) -> Iterator[int]:
 
 
 def feed(port: int, seconds: float) -> None:
-    """The autopilot: a vehicle at rest. Packed before it is sent, as far as memory allows: a real one has a processor of its
-    own, and does not take away from fusiond's."""
+    """The autopilot of a vehicle at rest. Its messages are packed before they are sent, as far as memory allows: a real
+    autopilot has its own processor and does not use fusiond's."""
     packed = sent_by_autopilot(time.monotonic_ns(), seconds)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        if seconds <= PACKED_S:
+        if seconds <= MAX_PACKED_S:
             packed = iter(list(packed))
         for _, datagrams in zip(every(IMU_HZ, seconds), packed, strict=True):
             for datagram in datagrams:
@@ -129,7 +130,7 @@ def feed(port: int, seconds: float) -> None:
 
 
 def sent_by_autopilot(begin_ns: int, seconds: float) -> Iterator[list[bytes]]:
-    """What it sends at each inertial sample. Its clock began at `begin_ns`: a constant offset, which fusiond finds."""
+    """The datagrams of each inertial sample. The autopilot's clock starts at `begin_ns`: fusiond finds that offset."""
     link = common.MAVLink(None, srcSystem=1, srcComponent=1)
 
     def packed(message: common.MAVLink_message) -> bytes:
@@ -153,7 +154,7 @@ def sent_by_autopilot(begin_ns: int, seconds: float) -> Iterator[list[bytes]]:
 
 
 def publish_only(port: int, seconds: float) -> None:
-    """The reference: bytes of a state's size with the instant they were due, put at the rate of the publications."""
+    """The reference: put the size of a state, with the instant at which it was due, at the rate of publications."""
     section = Zenoh(listen=[f"tcp/127.0.0.1:{port}"])
     with open_session(section) as session:
         publisher = session.declare_publisher(
@@ -162,12 +163,12 @@ def publish_only(port: int, seconds: float) -> None:
         print("ready", flush=True)
         begin_ns = time.time_ns()
         for number in every(PUBLISH_HZ, seconds):
-            due_ns = begin_ns + number * 1_000_000_000 // PUBLISH_HZ
+            due_ns = begin_ns + number * SECOND // PUBLISH_HZ
             publisher.put(due_ns.to_bytes(8, "little") + bytes(STATE_BYTES))
 
 
 class Arrival(msgspec.Struct, array_like=True):
-    """Of one publication at its reader."""
+    """One publication at its reader."""
 
     t_ns: int  # the instant of the publication
     arrived_ns: int
@@ -175,19 +176,19 @@ class Arrival(msgspec.Struct, array_like=True):
 
 
 class Reading(msgspec.Struct):
-    """What a reader tells."""
+    """The result of a reader."""
 
     arrivals: list[Arrival]
-    stolen: list[tuple[int, int]]  # instant [ns] and what the host had taken till then [ticks of all processors]
-    dropped: int = 0  # on the way to Zenoh
+    stolen: list[tuple[int, int]]  # instant [ns] and steal counter [ticks of all processors]
+    dropped: int = 0  # publications dropped on the way to Zenoh
 
     def stolen_share(self) -> float:
-        """Of the processors' time."""
+        """The share of the processors' time that the host took."""
         (begin_ns, before), (end_ns, after) = self.stolen[0], self.stolen[-1]
-        return (after - before) / os.sysconf("SC_CLK_TCK") / ((end_ns - begin_ns) / 1e9 * (os.cpu_count() or 1))
+        return (after - before) / os.sysconf("SC_CLK_TCK") / ((end_ns - begin_ns) / SECOND * (os.cpu_count() or 1))
 
     def undisturbed(self) -> list[Arrival]:
-        """What came while the host took nothing."""
+        """Arrivals that steal did not disturb."""
         instants = [t_ns for t_ns, _ in self.stolen]
         found = []
         for arrival in self.arrivals:
@@ -199,16 +200,16 @@ class Reading(msgspec.Struct):
 
 
 def watch_host(seconds: float) -> list[tuple[int, int]]:
-    """What the host has taken from this machine's processors, again and again."""
+    """The steal counter of this machine, read repeatedly."""
     found = []
     for _ in every(round(1 / LOOK_S), seconds):
         found.append((time.time_ns(), int(Path("/proc/stat").read_text().split(maxsplit=9)[8])))
     return found
 
 
-def tell(reading: Reading) -> None:
-    """To the process that started this one."""
-    reading.arrivals = reading.arrivals[SETTLE:]
+def report(reading: Reading) -> None:
+    """Write the result for the process that started this one."""
+    reading.arrivals = reading.arrivals[WARM_UP:]
     sys.stdout.buffer.write(msgspec.json.encode(reading))
 
 
@@ -222,7 +223,7 @@ def subscribe_only(port: int, seconds: float) -> None:
     section = Zenoh(mode="client", listen=[], connect=[f"tcp/127.0.0.1:{port}"])
     with open_session(section) as session, session.declare_subscriber(REFERENCE_KEY, take):
         stolen = watch_host(seconds)
-    tell(Reading(found, stolen))
+    report(Reading(found, stolen))
 
 
 def subscribe(port: int, seconds: float) -> None:
@@ -236,7 +237,7 @@ def subscribe(port: int, seconds: float) -> None:
         print("ready", flush=True)
         stolen = watch_host(seconds)
         dropped = client.health().outputs["zenoh"].dropped
-    tell(Reading(found, stolen, dropped))
+    report(Reading(found, stolen, dropped))
 
 
 def since_due_ms(arrival: Arrival) -> float:
@@ -251,8 +252,8 @@ def quantiles(found: list[float]) -> str:
     if len(found) < 2:
         return f"{len(found)} arrivals"
     cuts = statistics.quantiles(found, n=1000)
-    told = ", ".join(f"{name} {cuts[at]:.2f}" for name, at in (("p50", 499), ("p90", 899), ("p99", 989), ("p99.9", 998)))
-    return f"{told}, max {max(found):.2f} ms ({len(found)} arrivals)"
+    values = ", ".join(f"{name} {cuts[at]:.2f}" for name, at in (("p50", 499), ("p90", 899), ("p99", 989), ("p99.9", 998)))
+    return f"{values}, max {max(found):.2f} ms ({len(found)} arrivals)"
 
 
 def turn_wheels(seconds: float) -> None:
@@ -265,7 +266,7 @@ def turn_wheels(seconds: float) -> None:
 
 
 class Meter:
-    """CPU time of calls, by stage, in the thread that makes them. A stage inside another is not counted twice."""
+    """CPU time of calls by stage, in the calling thread. A stage inside another one is not counted twice."""
 
     def __init__(self) -> None:
         self.spent: dict[str, int] = {}
@@ -288,13 +289,13 @@ class Meter:
 
 
 def watch_stages(daemon: Daemon, meter: Meter) -> None:
-    """The estimator's thread, stage by stage."""
+    """Measure the stages of the estimator's thread."""
     live = daemon.live
     for source in daemon.inputs.values():
         meter.watch(source, "decode", f"decode {source.name}")
         meter.watch(source, "record", "black box")
     meter.watch(live, "record", "black box")
-    meter.watch(live.engine.fusion, "receive", "align and fuse")
+    meter.watch(live.engine.fusion, "feed", "align and fuse")
     meter.watch(live.engine, "message", "predict and make the state message")
     assert live.engine.publication is not None
     meter.watch(live.engine.publication, "health", "health")
@@ -309,13 +310,13 @@ def threads_ms() -> dict[str, float]:
     for task in Path("/proc/self/task").iterdir():
         name, _, rest = (task / "stat").read_text().partition(") ")
         fields = rest.split()
-        told = names.get(int(task.name)) or f"Zenoh's own: {name.split('(', 1)[1]}"
-        found[told] = found.get(told, 0.0) + (int(fields[11]) + int(fields[12])) * tick_ms
+        thread = names.get(int(task.name)) or f"Zenoh's own: {name.split('(', 1)[1]}"
+        found[thread] = found.get(thread, 0.0) + (int(fields[11]) + int(fields[12])) * tick_ms
     return found
 
 
 def set_timer_slack(slack_ns: int) -> None:
-    """Of the calling thread and those that it makes."""
+    """Set the timer slack of the calling thread and of the threads that it starts."""
     if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_TIMERSLACK, slack_ns) != 0:
         raise OSError(ctypes.get_errno(), "prctl")
 
@@ -331,7 +332,7 @@ def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def reference(udp: int, seconds: float) -> Reading:
-    """What `subscribe_only` tells."""
+    """The result of `subscribe_only`."""
     port = free_port(socket.SOCK_STREAM)
     longer = ("--seconds", seconds + 2)
     with process("--publish-only", port, *longer) as publisher, process("--feed", udp, *longer):
@@ -342,7 +343,7 @@ def reference(udp: int, seconds: float) -> Reading:
 
 
 async def measure(folder: Path, seconds: float, *, on_imu: bool) -> tuple[Reading, str]:
-    """What reached the subscriber, and what the daemon says of itself."""
+    """The subscriber's result, and the daemon's own figures."""
     udp, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     daemon, meter = Daemon(configuration(folder, udp, tcp, on_imu=on_imu)), Meter()
     run = asyncio.create_task(serve(daemon))
@@ -358,7 +359,7 @@ async def measure(folder: Path, seconds: float, *, on_imu: bool) -> tuple[Readin
         meter.spent.clear()
         await asyncio.sleep(seconds - 1)
         after, took_ms = threads_ms(), (time.monotonic() - begin) * 1000
-        told = await asyncio.to_thread(reader.stdout.read)
+        result = await asyncio.to_thread(reader.stdout.read)
     health = daemon.health
     await asyncio.to_thread(wheels.join)
     daemon.stop()
@@ -371,15 +372,15 @@ async def measure(folder: Path, seconds: float, *, on_imu: bool) -> tuple[Readin
     spent = {name: ms - before.get(name, 0.0) for name, ms in after.items()}
     lines += ["", f"CPU, in percent of one core: {100 * sum(spent.values()) / took_ms:.1f}"]
     lines += [f"  {100 * ms / took_ms:5.1f}  {name}" for name, ms in sorted(spent.items(), key=lambda item: -item[1])]
-    lines += ["of which in the estimator's thread:"]
+    lines += ["of these, in the estimator's thread:"]
     stages = sorted(meter.spent.items(), key=lambda item: -item[1])
     lines += [f"  {100 * ns / 1e6 / took_ms:5.1f}  {stage}" for stage, ns in stages]
     lines += [f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB; {daemon.losses()}"]
-    return msgspec.json.decode(told, type=Reading), "\n".join(lines)
+    return msgspec.json.decode(result, type=Reading), "\n".join(lines)
 
 
-def told_of(what: str, readings: list[Reading], latency_ms: Callable[[Arrival], float] = since_due_ms) -> str:
-    """Of one or several runs."""
+def summary(what: str, readings: list[Reading], latency_ms: Callable[[Arrival], float] = since_due_ms) -> str:
+    """The latencies of one or several runs, in words."""
     share = statistics.fmean(reading.stolen_share() for reading in readings)
     every_ms = [latency_ms(arrival) for reading in readings for arrival in reading.arrivals]
     calm_ms = [latency_ms(arrival) for reading in readings for arrival in reading.undisturbed()]
@@ -387,11 +388,11 @@ def told_of(what: str, readings: list[Reading], latency_ms: Callable[[Arrival], 
   the host took {100 * share:.1f} % of the processors; while it took nothing: {quantiles(calm_ms)}"""
 
 
-def told_of_both(states: list[Reading], references: list[Reading]) -> str:
+def whole_summary(states: list[Reading], references: list[Reading]) -> str:
     rows = (
-        told_of("from the instant of a publication to the subscriber", states),
-        told_of("from the stamp of its newest IMU sample to the subscriber", states, since_sample_ms),
-        told_of("reference, a bare Zenoh publisher to its subscriber", references),
+        summary("from the instant of a publication to the subscriber", states),
+        summary("from the stamp of its newest IMU sample to the subscriber", states, since_sample_ms),
+        summary("reference, a bare Zenoh publisher to its subscriber", references),
     )
     return "\n".join(rows)
 
@@ -401,7 +402,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--out", type=Path, default=Path("out/latency"))
     parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--as-installed", action="store_true", help=f"nice {NICE}, as the unit has it; it takes a privilege")
+    parser.add_argument("--as-installed", action="store_true", help=f"nice {NICE}, as the unit has it; needs a privilege")
     parser.add_argument("--by-clock", action="store_true", help="a publication does not wait for an inertial sample")
     parser.add_argument("--feed", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--subscribe", type=int, help=argparse.SUPPRESS)
@@ -428,14 +429,14 @@ def main(arguments: list[str]) -> None:
         print(f"fusiond {__version__}, Python {python}, {cpus} CPUs, nice {nice}, {options.seconds:g} s, {way}", flush=True)
         states, references = [], []
         for number in range(options.runs):
-            reading, report = asyncio.run(measure(options.out, options.seconds, on_imu=not options.by_clock))
+            reading, figures = asyncio.run(measure(options.out, options.seconds, on_imu=not options.by_clock))
             states.append(reading)
             references.append(reference(free_port(socket.SOCK_DGRAM), options.seconds))
             print(f"run {number + 1}: {len(reading.arrivals)} states, {reading.dropped} dropped on the way to Zenoh")
-            print(told_of_both([reading], references[-1:]))
-            print(report, flush=True)
+            print(whole_summary([reading], references[-1:]))
+            print(figures, flush=True)
         print(f"\nall {options.runs} runs")
-        print(told_of_both(states, references))
+        print(whole_summary(states, references))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""How long a killed daemon is away: from SIGKILL to the first state that a reader gets again.
+"""The outage of a killed daemon: from SIGKILL to the next state that a reader gets.
 
     python -m benchmarks.restart [--runs 8] [--out out/restart]
 
-`fusiond run` as the unit starts it, on a bench's load: IMU at 400 Hz and GNSS at 10 Hz over UDP, Zenoh over TCP, the black
-box on; the CAN bus is python-can's virtual one, silent. This process is the supervisor: it starts the daemon again after
-as long as systemd/fusiond.service says. The reference, each time in between: an interpreter that imports what the daemon
-cannot do without, NumPy, asyncio, Zenoh, python-can, cantools and pymavlink, and nothing else.
+`fusiond run` as the unit starts it, under load: IMU at 400 Hz and GNSS at 10 Hz over UDP, Zenoh over TCP, the black box
+on, python-can's virtual CAN bus without frames. This process is the supervisor: it restarts the daemon after the pause
+that systemd/fusiond.service sets. The reference, before each kill: a Python process that only imports the libraries that
+the daemon needs, which are NumPy, asyncio, Zenoh, python-can, cantools and pymavlink.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LIMIT_S = 20.0
 
 
 def restart_s() -> float:
-    """What the unit waits before it starts the service again."""
+    """The pause before the unit restarts the service."""
     found = re.search(r"^RestartSec=(\d+)ms$", UNIT.read_text(), re.MULTILINE)
     assert found is not None
     return int(found[1]) / 1000
@@ -46,7 +46,7 @@ def start(config: Path) -> subprocess.Popen[bytes]:
 
 
 def libraries_s() -> float:
-    """The reference."""
+    """The time of the reference."""
     began = time.monotonic()
     subprocess.run([sys.executable, "-c", LIBRARIES], env=os.environ | {"OPENBLAS_NUM_THREADS": "1"}, check=True)
     return time.monotonic() - began
@@ -83,7 +83,7 @@ def measure(folder: Path, runs: int) -> None:
     each = ", ".join(f"{one:.2f}" for one in away)
     middle, reference = statistics.median(away), statistics.median(bare)
     print(f"SIGKILL to the first state at a reader: {each} s; median {middle:.2f}, worst {max(away):.2f} s")
-    print(f"reference, its libraries alone: median {reference:.2f}, worst {max(bare):.2f} s; ratio {middle / reference:.2f}")
+    print(f"reference, the libraries alone: median {reference:.2f}, worst {max(bare):.2f} s; ratio {middle / reference:.2f}")
 
 
 if __name__ == "__main__":

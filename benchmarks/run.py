@@ -1,14 +1,15 @@
-"""`make bench`: what the filter costs, as medians and ratios against a named reference measured in the same run.
+"""`make bench`: the cost of the filter, as medians and as ratios to a named reference measured in the same run.
 
     python -m benchmarks.run [--minutes M] [--repeats N] [--out FOLDER]
 
-All times are CPU time of the process, so that other work on the machine disturbs them little. The log is simulated once
+All times are CPU time of the process, which other work on the machine disturbs little. The log is simulated once
 for the given length (default 60 minutes, seed in the output) and kept in the folder.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import platform
 import statistics
 import subprocess
@@ -27,14 +28,15 @@ from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.filter.kernel.interpreted import Kernel, make_kernel
-from fusiond.filter.parameters import SECOND
 from fusiond.filter.rows import ROW
 from fusiond.filter.state import NEVER, T_LAST, FilterState, T
 from fusiond.simulation.scenario import parse
+from fusiond.units import MILLISECOND, SECOND
 from fusiond_adapters.logs.write import write_drive
 
 SEED = 11
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+WHEEL_HZ, GNSS_HZ = 100, 10
 T0 = 1_700_000_000 * SECOND
 FORCE_B, RATE_B = np.array([0.1, 0.2, -9.8]), np.array([0.001, 0.002, 0.003])
 LATITUDE, LONGITUDE, HEIGHT = 0.84, 0.2, 500.0  # rad, rad, m: where the vehicle of the rewinds stands
@@ -44,15 +46,15 @@ COURSE = [  # one round of the simulated course: duration [s], speed at its end 
     (15, 9, 60), (10, 0, 0), (10, 0, 0), (20, 15, 0), (20, 0, -60),
 ]  # fmt: skip
 
-# Of memory the kernel's own high-water mark: ru_maxrss of a child begins at what its parent used.
-TELL_USAGE = """
+# The memory is Linux's high-water mark: ru_maxrss of a child starts at the value of its parent.
+PRINT_USAGE = """
 import atexit, resource
-def tell():
+def print_usage():
     used = resource.getrusage(resource.RUSAGE_SELF)
     with open("/proc/self/status") as status:
         peak_kb = next(line.split()[1] for line in status if line.startswith("VmHWM"))
     print("USED", used.ru_utime + used.ru_stime, peak_kb)
-atexit.register(tell)
+atexit.register(print_usage)
 """
 READ_MAVLINK = """
 import os, sys
@@ -116,18 +118,20 @@ def event(t_ns: int, source: str, sequence: int) -> Measurement:
 
 
 def running(imu_hz: int, seconds: float, compiled: bool = True, **filter_keys: float) -> tuple[Fusion, int]:
-    """A filter that ran for some seconds on an IMU, four wheels at 100 Hz and a receiver at 10 Hz; and its instant."""
+    """A filter that ran for some seconds on an IMU, four wheels at 100 Hz and a receiver at 10 Hz, and the instant that it
+    has reached. The receiver ends a second before the end."""
+
+    def instants(rate_hz: int, first_ms: int, until_s: float) -> list[int]:
+        count = math.ceil((until_s - first_ms / 1000) * rate_hz)
+        return [T0 + first_ms * MILLISECOND + k * SECOND // rate_hz for k in range(count)]
+
+    streams = {"imu0": instants(imu_hz, 0, seconds)}
+    streams |= {wheel: instants(WHEEL_HZ, 3, seconds) for wheel in WHEELS}
+    streams |= {f"gps0.{kind}": instants(GNSS_HZ, 7, seconds - 1) for kind in ("position", "velocity")}
+    events = [event(t_ns, source, k) for source, stamps in streams.items() for k, t_ns in enumerate(stamps)]
     fusion = Fusion(config(**filter_keys), compiled)
-    for k in range(round(seconds * 1000)):
-        t_ns = T0 + k * SECOND // 1000
-        if k % (1000 // imu_hz) == 0 or (imu_hz == 400 and k % 5 in (0, 2)):
-            fusion.take(event(t_ns, "imu0", k))
-        if k % 10 == 3:
-            for wheel in WHEELS:
-                fusion.take(event(t_ns, wheel, k))
-        if k % 100 == 7 and t_ns < T0 + round((seconds - 1) * SECOND):
-            fusion.take(event(t_ns, "gps0.position", k))
-            fusion.take(event(t_ns, "gps0.velocity", k))
+    for measurement in sorted(events, key=lambda event: event.t_ns):
+        fusion.fuse(measurement)
     return fusion, fusion.history.applied_ns
 
 
@@ -150,7 +154,7 @@ def one_row(kernel: Kernel, head: FilterState, fusion: Fusion, source: str) -> C
 
 
 def kernel_lines(repeats: int) -> tuple[list[Line], Callable[[], object]]:
-    """The kernel against its twin; and one propagation called from Python, the unit of the rewinds."""
+    """The kernel against its twin, and one propagation called from Python, which is the reference of the rewinds."""
     fusion, _ = running(200, 3.0)
     fast, twin = make_kernel(fusion.plan, True), make_kernel(fusion.plan, False)
     head = fusion.history.head
@@ -185,19 +189,19 @@ def kernel_lines(repeats: int) -> tuple[list[Line], Callable[[], object]]:
 
 
 def rewind_lines(predict: Callable[[], object], repeats: int) -> list[Line]:
-    """A late fix, whole: placed, restored from a snapshot, everything after it run again, snapshots taken. The unit is
-    measured beside each, so that what disturbs the one disturbs the other."""
+    """A late fix, as a whole: insert it, restore a snapshot, run everything after it again, take snapshots. The reference is
+    measured alongside, so that the same disturbances affect both."""
     lines = []
     for imu_hz in (200, 400):
         for late_ms in (50, 100, 200, 500, 900):
             rows, times, units = [], [], []
             for _ in range(repeats):
                 fusion, now = running(imu_hz, 3.0, horizon_s=1.0)
-                for i in range(5):  # a few at one instant: each is an event more for those after it
-                    late = event(now - late_ms * 1_000_000 + i, "gps0.position", 10**6 + i)
+                for i in range(5):  # several at about one instant: each adds one event to the rewinds after it
+                    late = event(now - late_ms * MILLISECOND + i, "gps0.position", 10**6 + i)
                     before, begin = fusion.history.rerun, time.process_time_ns()
-                    fusion.take(late)
-                    fusion.history.catch_up()
+                    fusion.fuse(late)
+                    fusion.history.apply_rows()
                     times.append((time.process_time_ns() - begin) / 1000)
                     rows.append(fusion.history.rerun - before)
                     units.append(median_us(predict, 1, 200))
@@ -223,8 +227,8 @@ def rewind_lines(predict: Callable[[], object], repeats: int) -> list[Line]:
 
 
 def make_log(minutes: float, folder: Path) -> Path:
-    """A simulated drive of that length, as full as a car's logs are: IMU 200 Hz, GNSS 10 Hz, 120 ms late, the further
-    messages that PX4 sends an onboard computer; one CAN frame with four wheels at 100 Hz among 1500 others a second."""
+    """A simulated drive, with as much traffic as in a car: IMU at 200 Hz, GNSS at 10 Hz and 120 ms late, the other messages
+    that PX4 sends to an onboard computer, and one CAN frame with four wheels at 100 Hz among 1500 frames a second."""
     target = folder / f"drive-{minutes:g}min-{SEED}"
     if (target / "fusiond.toml").is_file():
         return target
@@ -254,17 +258,17 @@ def run_python(*arguments: str) -> tuple[float, float]:
     else:
         code += f"runpy.run_module({arguments[0]!r}, run_name='__main__', alter_sys=True)"
         rest = list(arguments)
-    wrapped = f"{TELL_USAGE}\n{code}"
+    wrapped = f"{PRINT_USAGE}\n{code}"
     done = subprocess.run([sys.executable, "-c", wrapped, *rest], check=True, capture_output=True, text=True)
     _, seconds, peak = next(line for line in reversed(done.stdout.splitlines()) if line.startswith("USED")).split()
     return float(seconds), int(peak) / 1024
 
 
 def log_lines(minutes: float, repeats: int, folder: Path) -> list[Line]:
-    """Replay of a whole log against reading it, and the memory for a short and for the long one."""
+    """Replay of a whole log against only reading it, and the peak memory for a short and the long log."""
     long, short = make_log(minutes, folder), make_log(max(SHORTEST_S / 60, minutes / 12), folder)
     tlog, candump = logs = [str(long / "drive.tlog"), str(long / "drive.log")]
-    used = []  # s, s, s, MB: MAVLink and CAN read, replay and its peak
+    used = []  # reading MAVLink [s] and CAN [s], replay [s] and its peak memory [MB]
     for _ in range(repeats):
         mavlink, _ = run_python("-c", READ_MAVLINK, tlog)
         can, _ = run_python("-c", READ_CAN, candump)

@@ -1,10 +1,10 @@
-"""Whether fusiond keeps its memory and loses count of nothing, under full load for a long time; and whether the replay of
-what it recorded publishes the same bytes.
+"""A long run under full load: whether memory stays flat, every event is counted, and a replay of the recording publishes
+the same bytes.
 
     python -m benchmarks.soak [--minutes 60] [--real-time] [--out out/soak]
 
-The load is that of benchmarks.latency. Accelerated, frames go into the inboxes with stamps of a simulated clock, as fast
-as they are taken; in real time they come over UDP and a virtual CAN bus. The exit status is 1 where something is wrong.
+The load is that of benchmarks.latency. By default frames go straight into the inboxes with stamps of a simulated clock, as
+fast as they are processed. With --real-time they come over UDP and a virtual CAN bus. The exit status is 1 on failure.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config.schema import Config
 from fusiond.messages.codec import encode
 from fusiond.messages.types import StateMessage
+from fusiond.units import SECOND
 from fusiond_adapters.can.bus import CanFrame
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.play import PlayedClock
 
-SECOND = 1_000_000_000  # ns
 BEGIN_NS = 1_760_000_000 * SECOND
 SINCE_BOOT_NS = 60 * SECOND  # at the start
-APART_NS = 200_000  # frames of one instant
-SETTLED_S = 300.0  # memory is flat from here on
+APART_NS = 200_000  # between frames of one instant
+WARM_UP_S = 300.0  # after this, memory must stay flat
 FLAT_MB = 2.0
 DIGEST = 8  # bytes of a publication's digest
-LOOKS = 20  # at the memory
+LOOKS = 20  # reports of the memory in a run
 
 
 def rss_mb() -> float:
@@ -51,14 +51,14 @@ def rss_mb() -> float:
 
 
 class Published:
-    """Digests of everything published, in a file: a list would be the growth that is looked for."""
+    """Digests of everything published, in a file: a list in memory would itself grow."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.count = 0
         self._file = file
 
     def add(self, message: StateMessage) -> None:
-        """From the estimator."""
+        """Called by the estimator."""
         self.count += 1
         self._file.write(digest(message))
 
@@ -68,29 +68,29 @@ def digest(message: StateMessage) -> bytes:
 
 
 class Memory:
-    """Looks at the memory as the run goes on."""
+    """Reports the memory during the run, and its growth after the warm-up."""
 
     def __init__(self, seconds: float) -> None:
-        self.settled_mb: float | None = None
-        self._settled_s, self._every = min(SETTLED_S, seconds / 2), seconds / LOOKS
+        self.after_warm_up_mb: float | None = None
+        self._warm_up_s, self._every = min(WARM_UP_S, seconds / 2), seconds / LOOKS
         self._next = 0.0
 
     def look(self, elapsed_s: float) -> None:
-        """To be called often."""
-        if self.settled_mb is None and elapsed_s >= self._settled_s:
-            self.settled_mb = rss_mb()
+        """Call this often."""
+        if self.after_warm_up_mb is None and elapsed_s >= self._warm_up_s:
+            self.after_warm_up_mb = rss_mb()
         if elapsed_s >= self._next:
             self._next += self._every
             print(f"{elapsed_s:6.0f} s  {rss_mb():7.2f} MB", flush=True)
 
     def growth_mb(self) -> float:
-        """Since it settled."""
-        assert self.settled_mb is not None
-        return rss_mb() - self.settled_mb
+        """Since the warm-up."""
+        assert self.after_warm_up_mb is not None
+        return rss_mb() - self.after_warm_up_mb
 
 
 def frames(seconds: float) -> Iterator[tuple[int, bytes | CanFrame]]:
-    """Instant [ns from the start] and frame: what benchmarks.latency sends, from a vehicle at rest."""
+    """Instants [ns from the start] and frames: those of benchmarks.latency, of a vehicle at rest."""
     for number, (imu, *others) in enumerate(sent_by_autopilot(SINCE_BOOT_NS, seconds)):
         t_ns = number * SECOND // IMU_HZ
         yield t_ns, imu
@@ -101,7 +101,7 @@ def frames(seconds: float) -> Iterator[tuple[int, bytes | CanFrame]]:
 
 
 def accelerated(settings: Config, seconds: float, published: Published, memory: Memory, box: Path) -> Daemon:
-    """As fast as it goes, on a simulated clock."""
+    """Run on a simulated clock, as fast as possible."""
     clock = PlayedClock(BEGIN_NS, 1.0)
     daemon = Daemon(settings, sinks=[published.add], zenoh=False, clock=clock)
     link, bus = daemon.inputs["mavlink.fc"], daemon.inputs["can.car"]
@@ -124,7 +124,7 @@ def accelerated(settings: Config, seconds: float, published: Published, memory: 
 
 
 async def in_real_time(settings: Config, seconds: float, published: Published, memory: Memory) -> Daemon:
-    """Over the live inputs."""
+    """Run over the live inputs."""
     daemon = Daemon(settings, sinks=[published.add])
     run = asyncio.create_task(daemon.run())
     await daemon.up.wait()
@@ -143,7 +143,7 @@ async def in_real_time(settings: Config, seconds: float, published: Published, m
 
 
 def replayed(settings: Config, box: Path, digests: Path) -> tuple[int, int]:
-    """States that a replay of the recording publishes, and how many of them are not what was published live."""
+    """The number of states that a replay of the recording publishes, and how many differ from those published live."""
     count = other = 0
     with digests.open("rb") as file:
 
@@ -158,7 +158,7 @@ def replayed(settings: Config, box: Path, digests: Path) -> tuple[int, int]:
 
 
 def soak(seconds: float, out: Path, *, real_time: bool) -> bool:
-    """Run, tell what was found, and whether it is as it should be."""
+    """Run, print the results, and return whether all is well."""
     settings = configuration(out, free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM))
     memory, digests = Memory(seconds), out / "digests"
     with TemporaryDirectory(dir=out.resolve()) as box:  # a relative folder would be relative to the configuration
@@ -174,13 +174,13 @@ def soak(seconds: float, out: Path, *, real_time: bool) -> bool:
         growth_mb = memory.growth_mb()
         took_s = time.monotonic() - begin
         print(f"{seconds:.0f} s of load in {took_s:.0f} s")
-        print(f"memory settled at {memory.settled_mb:.2f} MB, then {growth_mb:+.2f} MB")
+        print(f"memory after the warm-up {memory.after_warm_up_mb:.2f} MB, then {growth_mb:+.2f} MB")
         totals = daemon.live.engine.fusion.totals()
         accounted = sum(totals.values()) == daemon.live.offered
         print(f"measurements: {daemon.live.offered} offered, {sum(totals.values())} accounted for: {totals}")
         print(f"lost: {daemon.losses()}")
         count, other = replayed(settings, Path(box), digests)
-    print(f"states: {published.count} published, {count} replayed, {other} of them not the same bytes")
+    print(f"states: {published.count} published, {count} replayed, {other} of them with other bytes")
     return growth_mb <= FLAT_MB and accounted and count > 0 and not other
 
 

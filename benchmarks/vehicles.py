@@ -1,9 +1,10 @@
-"""Many vehicles through one Zenoh router: what arrives, what is lost, how late.
+"""Many vehicles through one Zenoh router: what arrives, what is lost, and how late.
 
     python -m benchmarks.vehicles [--vehicles 20] [--rate 100] [--seconds 20] [--processes 4]
 
-Each vehicle has a session and a publisher of its own, those of the daemon: states at the rate, and what is told reliably,
-a health and an event each second. The router, the vehicles (some to a process) and the reader are processes of their own.
+Each vehicle has its own session and publisher, as in the daemon. It publishes states at the rate, and each second a health
+message and an event, which Zenoh delivers reliably. The router, the vehicles (several per process) and the reader run in
+separate processes.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 
 from fusiond.app.client import Client
-from fusiond.config.schema import Zenoh
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.config.outputs import Zenoh
+from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import (
     EventMessage,
@@ -38,20 +39,20 @@ from fusiond.messages.types import (
 )
 from fusiond_adapters.zenoh.session import KIND, ZenohPublisher, open_session
 
-GRACE_S = 3.0  # after the last publication, for what is fetched again
+GRACE_S = 3.0  # after the last publication, for messages that are fetched again
 COUNTS = OutcomeCounts(fused=48_211, rejected=37)
 KINDS: tuple[type[Message], ...] = (StateMessage, HealthMessage, EventMessage)
 
 
 def state(vehicle: str, t_ns: int) -> StateMessage:
     three = (0.1234567891234, -2.3456789, 0.012345678)
-    told = StateEstimate(
+    solution = SolutionState(
         latitude=0.8401234, longitude=0.2012345, height=112.3, velocity_n=three, quaternion_nb=(0.98, 0.1, 0.1, 0.1),
         angular_rate_b=three, acceleration_b=three, gyro_bias=three, accel_bias=three, wheel_scale=0.012, mount=(0.01, 0.02),
         covariance=np.eye(9) * 0.123456789, sigma_gyro_bias=three, sigma_accel_bias=three, sigma_wheel_scale=1e-3,
         sigma_mount=(1e-3, 2e-3),
     )  # fmt: skip
-    return state_message(Estimate(t_ns, Mode.NOMINAL, 2_500_000, 0, told), vehicle, COUNTS)
+    return state_message(Solution(t_ns, Mode.NOMINAL, 2_500_000, 0, solution), vehicle, COUNTS)
 
 
 def health(vehicle: str, t_ns: int) -> HealthMessage:
@@ -73,7 +74,7 @@ def route(port: int) -> None:
 
 
 def publish(port: int, names: list[str], rate: float, seconds: float) -> None:
-    """Some vehicles, one after the other in each period. Prints how many messages of each kind each has published."""
+    """Publish for several vehicles, in turn within each period. Prints the number of messages of each kind per vehicle."""
     section = Zenoh(mode="client", listen=[], connect=[f"tcp/127.0.0.1:{port}"])
     with ExitStack() as stack:
         vehicles = [
@@ -94,7 +95,7 @@ def publish(port: int, names: list[str], rate: float, seconds: float) -> None:
 
 
 def read(port: int) -> None:
-    """Counts what arrives, each message once, until its standard input ends; then prints it."""
+    """Count what arrives, each message once, until standard input ends; then print the counts."""
     seen: dict[type[Message], set[tuple[str, int]]] = {kind: set() for kind in KINDS}
     doubles: Counter[str] = Counter()
     late_ms: list[float] = []

@@ -7,6 +7,7 @@ import numpy as np
 from fusiond.config import load as config
 from fusiond.events import GnssVelocity, WheelSpeed
 from fusiond.timeline.clock import Clock
+from fusiond.units import SECOND
 from fusiond_adapters.logs.merge import open_logs
 
 settings = config.load(sys.argv[1])
@@ -17,9 +18,9 @@ for event in open_logs(sys.argv[2:], settings):
         continue
     payload = measurement.payload
     if isinstance(payload, GnssVelocity):
-        gnss.append((measurement.t_ns / 1e9, np.hypot(payload.north, payload.east)))
+        gnss.append((measurement.t_ns / SECOND, np.hypot(payload.north, payload.east)))
     elif isinstance(payload, WheelSpeed):
-        wheels.append((measurement.t_ns / 1e9, abs(payload.speed)))
+        wheels.append((measurement.t_ns / SECOND, abs(payload.speed)))
 t_gnss, gnss_speed = np.array(gnss).T
 t_wheel, wheel_speed = np.array(sorted(wheels)).T
 inside = (t_gnss > t_wheel[0] + 1) & (t_gnss < t_wheel[-1] - 1)

@@ -11,6 +11,7 @@ from fusiond.app.replay.intervals import parse_interval
 from fusiond.config import load as config
 from fusiond.events import ImuSample
 from fusiond.timeline.clock import Clock
+from fusiond.units import SECOND
 from fusiond_adapters.logs.merge import open_logs
 
 settings = config.load(sys.argv[1])
@@ -21,7 +22,7 @@ for event in open_logs(sys.argv[2:3], settings):
     if measurement and isinstance(measurement.payload, ImuSample):
         sample = measurement.payload
         rows.append((measurement.t_ns, *sample.specific_force_b, *sample.angular_rate_b))
-t = (np.array([row[0] for row in rows]) - rows[0][0]) / 1e9
+t = (np.array([row[0] for row in rows]) - rows[0][0]) / SECOND
 samples = np.array([row[1:] for row in rows])[(t >= start_s) & (t < stop_s)]
 interval_s = float(np.median(np.diff(t)))
 white = np.diff(samples, axis=0).std(axis=0) / np.sqrt(2) * np.sqrt(interval_s)

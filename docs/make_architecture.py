@@ -21,7 +21,7 @@ SOURCES = {".py", ".pyx", ".pxi", ".pxd"}
 
 
 def page(text: str) -> str:
-    """The text of architecture.md, its generated parts made anew."""
+    """The text of architecture.md, with its generated parts renewed."""
     for name, body in (("layers", layers()), ("files", files())):
         part = re.compile(rf"(<!-- {name}, generated -->\n).*?(<!-- end -->)", re.DOTALL)
         text = part.sub(lambda found, body=body: f"{found[1]}\n{body}\n{found[2]}", text)  # type: ignore[misc]
@@ -70,7 +70,7 @@ def source(entry: str) -> Path:
 
 
 def said(path: Path) -> str:
-    """The first sentence of what a file says of itself."""
+    """The first sentence of a file's docstring."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
         about = ast.get_docstring(ast.parse(text)) or ""

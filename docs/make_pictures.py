@@ -26,11 +26,12 @@ from fusiond.app.replay.replay import Replay, Wants
 from fusiond.app.replay.summary import Summary
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config
-from fusiond.estimator.fusion import state_estimate
+from fusiond.estimator.fusion import solution_state
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import CHOOSING, LAST_SPEED, PHASE
 from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMessage
 from fusiond.simulation.scenario import parse
+from fusiond.units import SECOND, nanoseconds
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
 
@@ -133,7 +134,7 @@ def errors_of(track: Path, first_ns: int) -> Errors:
         truth = Truth(parse_truth(reference, "truth.csv"))
         for row in csv.DictReader(file):
             t_ns = int(row["unix_us"]) * 1000
-            true, second = truth.at(t_ns), (t_ns - first_ns) / 1e9
+            true, second = truth.at(t_ns), (t_ns - first_ns) / SECOND
             if true is None or not row["lat_deg"] or not SECONDS.start_s <= second <= SECONDS.stop_s:
                 continue
             origin = true.lat_deg, true.lon_deg
@@ -244,7 +245,7 @@ def seen(scenario: str, look: Callable[[Replay, StateMessage], tuple[float, ...]
         settings = config.load(folder / "fusiond.toml")
 
         def take(message: StateMessage, _: object) -> None:
-            second.append(run.elapsed_ns / 1e9)
+            second.append(run.elapsed_ns / SECOND)
             looks.append(look(run, message))
 
         run = Replay(settings, Wants(50.0, on_tick=[take]))
@@ -265,7 +266,7 @@ def draw_bank() -> None:
         if message.state:
             return message.state.yaw_deg % 360, message.state.sigma_yaw_deg
         left = np.flatnonzero(head.bank[:, 0]) if head.stamps[PHASE] == CHOOSING else []
-        yaws = (math.degrees(state_estimate(head.hypothesis(i), kernel).euler()[2]) % 360 for i in left)
+        yaws = (math.degrees(solution_state(head.hypothesis(i), kernel).euler()[2]) % 360 for i in left)
         return (math.nan, *(number for i, yaw in zip(left, yaws, strict=True) for number in (float(head.bank[i, 0]), yaw)))
 
     second, looks, truth = seen(REVERSES, look)
@@ -295,10 +296,10 @@ def draw_slip() -> None:
         head, history = run.fusion.history.head, run.fusion.history
         wheel = float(head.memory[history.index["rear_left"], LAST_SPEED])
         speed = math.hypot(*message.state.velocity_ned_mps[:2]) if message.state else math.nan
-        return speed, wheel, *run.fusion.beliefs(message.t_ns)["rear_left"].probabilities
+        return speed, wheel, *run.fusion.health(message.t_ns)["rear_left"].probabilities
 
     second, looks, truth = seen(SLIPS, look)
-    speed, wheel, *beliefs = np.array(looks).T
+    speed, wheel, *probabilities = np.array(looks).T
     figure = figure_of(9, 4.4)
     top, bottom = figure.subplots(2, 1, sharex=True)
     top.plot(second, wheel, color=VERMILION, linewidth=1.0, label="rear left wheel")
@@ -308,7 +309,7 @@ def draw_slip() -> None:
     top.legend(loc="upper left", frameon=False, fontsize=8)
     top.set_title("A wheel spins 30 % too fast from 15 s to 20 s", loc="left", fontsize=10)
     colours = (GREEN, BLUE, VERMILION, ORANGE, GREY)
-    bottom.stackplot(second, *beliefs, colors=colours, labels=STATUSES, alpha=0.8, linewidth=0)
+    bottom.stackplot(second, *probabilities, colors=colours, labels=STATUSES, alpha=0.8, linewidth=0)
     bottom.set(ylabel="probability", xlabel="time [s]", xlim=(12, 24), ylim=(0, 1))
     bottom.legend(loc="center left", framealpha=0.9, fontsize=8)
     save(figure, "slip.png")
@@ -336,7 +337,7 @@ def draw_top() -> None:
 
     def take(message: Message) -> None:
         if isinstance(message, StateMessage):
-            until_ns[:] = until_ns or [message.t_ns + round(TOP_SECOND * 1e9)]
+            until_ns[:] = until_ns or [message.t_ns + nanoseconds(TOP_SECOND)]
         if isinstance(message, StateMessage | HealthMessage | EventMessage) and message.t_ns <= until_ns[0]:
             view.take(message)
 

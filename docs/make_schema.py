@@ -16,7 +16,7 @@ TABLE = re.compile(r"(<!-- fields of (\w+) -->\n).*?(<!-- end -->\n)", re.DOTALL
 
 
 def page(text: str) -> str:
-    """The text of messages.md, its tables made anew."""
+    """The text of messages.md, with its tables renewed."""
     definitions: dict[str, Any] = msgspec.json.schema_components(MESSAGES.values())[1]
 
     def table(found: re.Match[str]) -> str:

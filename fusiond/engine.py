@@ -85,7 +85,7 @@ class Engine:
     def feed(self, event: Received) -> Receipt | None:
         """Let time pass up to an event's receipt, fuse it, and publish what is due. None where it taught the clock only."""
         self.advance(event.t_receive_ns)
-        receipt = self.fusion.receive(event)
+        receipt = self.fusion.feed(event)
         if receipt is not None:
             if self.publication:
                 self.publication.add(event, receipt)
@@ -131,7 +131,7 @@ class Engine:
 
     def message(self, t_ns: int) -> StateMessage:
         """The state at an instant."""
-        return state_message(self.fusion.estimate_at(t_ns), self._vehicle, totals(self.fusion))
+        return state_message(self.fusion.solution_at(t_ns), self._vehicle, totals(self.fusion))
 
     # --- Ticks
 

@@ -1,4 +1,4 @@
-"""Events on their way into the filter: what an adapter received, and what the clock made of it. All SI, all frozen.
+"""Events on their way into the filter: as an adapter received them, and as the clock aligned them. All SI, all frozen.
 
 An adapter yields `Received`: a typed payload with the sensor's own stamp (if it has one), the clock that the stamp was
 read from, and the stamp of its receipt. `fusiond.timeline.clock` turns it into a `Measurement`: the same payload with one
@@ -64,15 +64,15 @@ class ClockPair(Struct, frozen=True, gc=False):
     """One instant read from two clocks at once (MAVLink SYSTEM_TIME): `Received.t_sensor_ns` on `Received.clock` is
     `t_ns` on `clock`. It aligns clocks and never reaches the filter.
 
-    With HOST_CLOCK as `clock` it is the answer to a question (MAVLink TIMESYNC), asked at `t_ns` of the host's time line:
-    the other clock was read at some instant between that and the receipt."""
+    With HOST_CLOCK as `clock` it is the reply to a request (MAVLink TIMESYNC) that was sent at `t_ns` of the host's time
+    line: the other clock was read at some instant between that and the receipt."""
 
     clock: str
     t_ns: int
 
 
 class Invalid(Struct, frozen=True, gc=False):
-    """A sample which its own protocol declares unusable (fault bit, bad checksum, no fix); counted with its reason."""
+    """A sample that its own protocol declares unusable (fault bit, bad checksum, no fix); it is counted with its reason."""
 
     reason: str
 
@@ -85,7 +85,7 @@ class Received(Struct, frozen=True, gc=False):
     """What an input adapter yields: one sample of one source, as it came in.
 
     `source` names a stream of one kind of payload (`imu0`, `gps0.position`, `gps0.velocity`, `rear_left`). `sequence`
-    counts a source's samples in the order of the sensor's sending, as far as the adapter can tell. `clock` names the
+    counts a source's samples in the order in which the sensor sent them, as far as the adapter knows. `clock` names the
     clock of `t_sensor_ns`: `unix`, `<link>/<system>/boot`, or an empty string together with None where there is no
     stamp.
     """
@@ -113,7 +113,7 @@ class Measurement(Struct, frozen=True, gc=False):
 
 
 UNIX_CLOCK = "unix"
-HOST_CLOCK = "host"  # that of the receipts
+HOST_CLOCK = "host"  # the clock of the receive stamps
 
 
 def boot_clock(link: str, system: int = 1) -> str:

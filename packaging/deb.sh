@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes dist/fusiond_VERSION_ARCHITECTURE.deb, for systems whose /usr/bin/python3 is of the version that PYTHON has here.
+# Makes dist/fusiond_VERSION_ARCHITECTURE.deb, for systems whose /usr/bin/python3 has the same version as PYTHON here.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
@@ -7,7 +7,7 @@ root=$PWD/build/deb
 rm -rf "$root"
 packaging/stage.sh "$root"
 
-# The target's own interpreter in place of this machine's.
+# Use the target's interpreter instead of this machine's.
 read -r minor next < <("$python" -c 'import sys; print(f"3.{sys.version_info[1]} 3.{sys.version_info[1] + 1}")')
 ln -sfn /usr/bin/python3 "$root/opt/fusiond/bin/python3"
 ln -sfn python3 "$root/opt/fusiond/bin/python"

@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# Lays fusiond out under a folder as it is to stand under /: a Python environment of its own in /opt/fusiond, units,
-# user, examples. `make install` gives it the root itself, `make deb` the tree of a package.
-#   packaging/stage.sh FOLDER      PYTHON: the interpreter; WHEEL: what pip is to install (default: these sources)
+# Installs fusiond below a folder, with the layout that it has below /: its own Python environment in /opt/fusiond, units,
+# user, examples. For `make install` the folder is the root itself, for `make deb` the tree of the package.
+#   packaging/stage.sh FOLDER      PYTHON: the interpreter; WHEEL: what pip installs (default: these sources)
 set -euo pipefail
 cd "$(dirname "$0")/.."
-root=${1?FOLDER is wanted; \"\" is the root itself}
+root=${1?FOLDER is missing; \"\" is the root itself}
 home=$root/opt/fusiond
 
 "${PYTHON:-python3}" -m venv --clear "$home"
 "$home/bin/python" -m pip install --quiet --disable-pip-version-check --root-user-action=ignore "${WHEEL:-.}"
-"$home/bin/python" -m pip uninstall --quiet --yes --root-user-action=ignore setuptools  # it has a hand in every start
-if [ -n "$root" ]; then  # paths as they will be
+"$home/bin/python" -m pip uninstall --quiet --yes --root-user-action=ignore setuptools  # it slows every start
+if [ -n "$root" ]; then  # paths as after the installation
     grep -rlIF "$home" "$home/bin" "$home/pyvenv.cfg" | xargs sed -i "s|$home|/opt/fusiond|g"
 fi
 

@@ -125,7 +125,7 @@ def _pressure(drive: Drive) -> Stamped:
 
 def _telemetry(truth: Truth, stream: Telemetry) -> Stamped:
     make = TELEMETRY[stream.message]
-    columns = (stream.t_receive_us, stream.counter, stream.boot_ms, stream.row)
+    columns = (stream.t_receive_us, stream.counter, stream.boot_ms, stream.instant)
     for t_us, counter, boot_ms, row in zip(*(column.tolist() for column in columns), strict=True):
         yield t_us, counter, make(truth, row, boot_ms)
 

@@ -16,7 +16,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fusiond.config.schema import Autopilot, Config
+from fusiond.config.outputs import Autopilot
+from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import State, StateMessage
 from fusiond.ports.outputs import POLL_S, Outbox

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from fusiond.config.schema import Ros2
+from fusiond.config.outputs import Ros2
 from fusiond.estimator.solution import Mode
 from fusiond.messages.local_frame import LocalFrame, OdometryFrame
 from fusiond.messages.types import HealthMessage, InputHealth, OutputHealth, SourceHealth, State, StateMessage

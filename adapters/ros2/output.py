@@ -11,8 +11,9 @@ from threading import Event
 
 import zenoh
 
-from fusiond.config.schema import Config, Ros2
-from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.config.outputs import Ros2
+from fusiond.config.outputs import Zenoh as ZenohSection
+from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.messages.types import HealthMessage, Message, StateMessage
 from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost

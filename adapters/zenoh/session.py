@@ -18,8 +18,8 @@ from typing import cast
 import zenoh
 import zenoh.ext
 
-from fusiond.config.schema import Encoding
-from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.config.outputs import Encoding
+from fusiond.config.outputs import Zenoh as ZenohSection
 from fusiond.messages.codec import encode
 from fusiond.messages.keys import key as key_of
 from fusiond.messages.types import MESSAGES, InnovationMessage, Message

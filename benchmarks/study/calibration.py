@@ -1,4 +1,4 @@
-"""What the installer did not measure: each calibration state's error against its sigma, over time."""
+"""Calibration and bias states: the error of each against its sigma, over time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LEARNT: dict[str, dict[str, Any]] = {
 
 
 class Shown(NamedTuple):
-    """A row of the table: the error states, and what turns SI into the unit that is told."""
+    """A row of the table: the error states, and the factor from SI to the unit shown."""
 
     states: tuple[int, ...]
     scale: float = 1.0

@@ -1,7 +1,7 @@
-"""Is the filter as wrong as it says, and as right as it could be: NEES, NIS and the Cramer-Rao bound in the nominal drive.
+"""Consistency and efficiency of the filter in the nominal drive: NEES, NIS and the Cramer-Rao bound.
 
-The filter is begun off the truth by a draw of the covariance that it is told. It is looked at once a second, just before
-a fix, when no fix is on its way, so that it has everything that the bound has.
+The filter starts from the truth plus a random error of its initial covariance. It is sampled once a second, just before a
+fix, when no fix is on its way, so that it has used every measurement that the bound has.
 """
 
 from __future__ import annotations

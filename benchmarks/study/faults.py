@@ -1,4 +1,4 @@
-"""Faults switched on in the nominal drive: how soon each is named, what it does to the position, and false alarms."""
+"""Faults in the nominal drive: how soon each is detected, its effect on the position, and false alarms."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from benchmarks.study import nominal
 from benchmarks.study.report import Section
 from benchmarks.study.runs import begun, drive, error, spread
 from benchmarks.study.world import GNSS_NAME, T0, Fault, Sensors
-from fusiond.filter.parameters import nanoseconds
 from fusiond.filter.state import POSITION, RESETS
+from fusiond.units import nanoseconds
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 START_S, STOP_S, END_S = 40.0, 65.0, 120.0
 LOOK_S = 0.05
-AFTER_S = 5.0  # after the fault, from when on the error counts as of after it
+AFTER_S = 5.0  # after the end of the fault, until errors count as after it
 FAULTS = {
     "wheel slips 30 %": Fault("rear_left", "scale", START_S, STOP_S, 1.3),
     "wheel locked, reads 0": Fault("rear_left", "scale", START_S, STOP_S, 0.0),
@@ -32,17 +32,17 @@ FAULTS = {
 }
 STOP_AND_GO = [(8, 0, 0, 0), (12, 0, 0, 0), (10, 14, 0, 0), (12, 14, 90, 2), (8, 0, 0, 0), (10, 8, -90, 0)]  # 60 s
 CITY = {"motion": {"standstill": True}, "wheel": {"unsigned": True, "least_mps": 0.1}}
-ALIKE = {"gnss": {"position_correlation_s": 10.0, "velocity_correlation_s": 1.0}}
+CORRELATED = {"gnss": {"position_correlation_s": 10.0, "velocity_correlation_s": 1.0}}
 GOOD_ROUNDS = 3  # of 60 s each
 GOOD: dict[str, tuple[list[tuple[float, float, float, float]], dict[str, dict[str, Any]]]] = {
     "nominal": (nominal.TOWN, {}),
-    "GNSS errors correlated over 10 s, and configured so": (nominal.TOWN, ALIKE),
+    "GNSS errors correlated over 10 s, and configured so": (nominal.TOWN, CORRELATED),
     "stop and go, unsigned wheels": (STOP_AND_GO, CITY),
 }
 
 
 class Watched(NamedTuple):
-    """What was believed of each source, (looks, sources) of statuses, and horizontal errors (looks,) [m]."""
+    """The status of each source at each look, and horizontal errors (looks,) [m]."""
 
     looks: list[float]
     statuses: dict[str, list[str]]
@@ -65,7 +65,7 @@ def watched(
     rounds: int, course: list[tuple[float, float, float, float]], changes: dict[str, dict[str, Any]],
     faults: tuple[Fault, ...], seed: list[int],
 ) -> Watched:  # fmt: skip
-    """Drive a course so many times, and ask every LOOK_S what is believed."""
+    """Drive `rounds` of a course, and read the health of the sources every LOOK_S."""
     random, config = np.random.default_rng(seed), nominal.config(**changes)
     world, fusion = begun(nominal.scenario(rounds, course=course, imu_hz=IMU_HZ), config, random)
     looks = np.arange(LOOK_S, world.t[-1], LOOK_S).tolist()
@@ -73,8 +73,8 @@ def watched(
     errors: list[float] = []
 
     def look(t: float, k: int) -> None:
-        for source, belief in fusion.beliefs(T0 + nanoseconds(t)).items():
-            statuses[source].append(belief.status)
+        for source, health in fusion.health(T0 + nanoseconds(t)).items():
+            statuses[source].append(health.status)
         errors.append(float(np.hypot(*(world.mat_ne[k] @ error(fusion.history.head, world, k)[POSITION])[:2])))
 
     drive(fusion, Sensors(world, WHEEL_HZ, faults=faults).measurements(), looks, look)
@@ -82,7 +82,7 @@ def watched(
 
 
 def alarms(statuses: list[str]) -> int:
-    """How often a source ceases to be called nominal."""
+    """How often the status of a source changes from nominal to another."""
     bad = [status != "nominal" for status in statuses]
     return sum(now and not before for before, now in zip([False, *bad], bad, strict=False))
 

@@ -1,4 +1,4 @@
-"""The vehicle is carried: its wheels read zero while it moves on a ferry, forwards or backwards."""
+"""A vehicle on a ferry: its wheels read zero while it is carried, forwards or backwards."""
 
 from __future__ import annotations
 

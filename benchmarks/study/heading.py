@@ -1,4 +1,4 @@
-"""From no heading to the right one: how long it takes, and whether the sigma is honest, from every start heading."""
+"""Starts without a heading: how long it takes to find it, and whether its sigma is consistent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.study.runs import drive, spread
 from benchmarks.study.world import T0, Sensors, World
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
-from fusiond.filter.parameters import nanoseconds
+from fusiond.units import nanoseconds
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 LOOK_S = 0.1
@@ -25,7 +25,7 @@ LEVEL_DEG = 3.0  # the default: it levels itself, on a biased accelerometer and 
 
 class Case(NamedTuple):
     """A start: the course [duration s, end speed m/s, turn deg, grade deg], first speed [m/s], grade [deg], when GNSS
-    comes [s], whether the wheels tell their direction."""
+    comes [s], whether wheel speeds are signed."""
 
     course: list[tuple[float, float, float, float]]
     speed: float = 0.0
@@ -82,11 +82,11 @@ def one(case: Case, heading_deg: float, seed: list[int]) -> Start:
 
     def look(t: float, k: int) -> None:
         i = next(index)
-        answer = fusion.estimate_at(T0 + nanoseconds(t)).state
-        if answer is not None:
+        state = fusion.solution_at(T0 + nanoseconds(t)).state
+        if state is not None:
             truth = np.arctan2(world.mat_nb[k, 1, 0], world.mat_nb[k, 0, 0])
-            errors[i] = abs((answer.euler()[2] - truth + np.pi) % (2 * np.pi) - np.pi)
-            sigmas[i] = answer.sigma_yaw()
+            errors[i] = abs((state.euler()[2] - truth + np.pi) % (2 * np.pi) - np.pi)
+            sigmas[i] = state.sigma_yaw()
 
     drive(fusion, Sensors(world, WHEEL_HZ).measurements(case.gnss_from), looks.tolist(), look)
     driving = np.interp(looks, world.t, np.abs(world.speed)) > MOVING_MPS

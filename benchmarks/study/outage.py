@@ -1,4 +1,4 @@
-"""How far dead reckoning drifts while GNSS is away, and how soon GNSS is believed when it is back."""
+"""The drift of dead reckoning during a GNSS outage, and how soon GNSS is fused after it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ IMU_HZ, WHEEL_HZ = 100.0, 20.0
 OUTAGES_S = (10.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 BEFORE_S, AFTER_S = 60.0, 20.0
 LOOK_S = 0.5
-BELIEVED_ERROR_S = 5.0  # after the return, when the error is looked at
+RETURNED_S = 5.0  # after the return of GNSS, when the error is taken
 
 
 class Outage(NamedTuple):
@@ -26,7 +26,7 @@ class Outage(NamedTuple):
     error: float
     sigma: float
     driven: float
-    believed: float
+    fused_after: float
     after: float
     resets: int
 
@@ -51,9 +51,9 @@ def one(seconds: float, seed: list[int]) -> Outage:
     fused = t[(t >= end - 1e-6) & ~rejected]
     inside = (world.t >= BEFORE_S) & (world.t < end)
     driven = float(np.abs(world.speed[inside]).sum() / world.sensor.rate_hz)
-    believed = float(fused[0] - end) if len(fused) else np.inf
+    fused_after = float(fused[0] - end) if len(fused) else np.inf
     return Outage(
-        errors[end - LOOK_S], sigmas[end - LOOK_S], driven, believed, errors[end + BELIEVED_ERROR_S],
+        errors[end - LOOK_S], sigmas[end - LOOK_S], driven, fused_after, errors[end + RETURNED_S],
         int(fusion.history.head.stamps[RESETS]),
     )  # fmt: skip
 
@@ -73,12 +73,12 @@ def outage(runs: int, seed: int) -> Section:
         claimed = float(np.sqrt(np.mean([o.sigma**2 for o in found])))
         rows.append(
             (f"{seconds:.0f} s", f"{np.mean([o.driven for o in found]):.0f} m", f"{rms:.2f} m", f"{claimed:.2f} m",
-             f"{np.median(share):.3f} %", f"{share.max():.3f} %", f"{max(o.believed for o in found):.1f} s",
+             f"{np.median(share):.3f} %", f"{share.max():.3f} %", f"{max(o.fused_after for o in found):.1f} s",
              f"{max(o.after for o in found):.2f} m", sum(o.resets for o in found))
         )  # fmt: skip
     head = (
         "outage", "driven", "RMSE at its end", "claimed", "drift, median", "drift, worst", "GNSS fused again, worst",
-        f"error {BELIEVED_ERROR_S:.0f} s later, worst", "resets",
+        f"error {RETURNED_S:.0f} s later, worst", "resets",
     )  # fmt: skip
     section.table(head, rows)
     picture, axis = figure()

@@ -1,4 +1,4 @@
-"""The autopilot reboots on the way: for seconds there is neither IMU nor GNSS, the wheels go on."""
+"""The autopilot reboots during the drive: no IMU and no GNSS for some seconds, while wheel speeds continue."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from fusiond.filter.state import ATTITUDE, PHASE, POSITION, RESETS, RUNNING, VEL
 
 IMU_HZ, WHEEL_HZ = 100.0, 20.0
 SILENT_S = (1.0, 3.0, 8.0)
-FIRST_S, LAST_S = 10.0, 70.0  # in between it begins, at random
-AFTER_S = 20.0  # when the errors are looked at
+FIRST_S, LAST_S = 10.0, 70.0  # the reboot begins at random between these
+AFTER_S = 20.0  # after the return, when the errors are taken
 LOOK_S = 0.1
 
 

@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.study.world import SECOND, T0, World
+from benchmarks.study.world import T0, World
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import Measurement
 from fusiond.filter.motion_constraints import watch
-from fusiond.filter.parameters import Plan, nanoseconds
+from fusiond.filter.parameters import Plan
 from fusiond.filter.rows import Outcome, Rows
 from fusiond.filter.state import (
     ACCEL_BIAS,
@@ -48,6 +48,7 @@ from fusiond.filter.state import (
 from fusiond.maths.rotation import matrix, quaternion, quaternion_exp, quaternion_multiply
 from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import Scenario
+from fusiond.units import SECOND, nanoseconds
 
 BLOCKS = {
     "position": POSITION,
@@ -60,7 +61,7 @@ BLOCKS = {
 }
 COLLECT_EVERY = 20  # inertial samples
 Result = TypeVar("Result")
-SETTLED_NS = SECOND // 2  # nothing is later than this in these drives
+MAX_LATE_NS = SECOND // 2  # no event of these drives is later than this
 START_POSITION, START_VELOCITY = 2.0, 0.3  # m, m/s: sigmas per axis of a start from the truth
 
 
@@ -159,7 +160,7 @@ def drive(
     due = T0 + nanoseconds(t) if t is not None else -1
     imu = next(iter(fusion.config.imu))
     for measurement in measurements:
-        fusion.take(measurement)
+        fusion.fuse(measurement)
         if ledger is not None and measurement.source == imu and measurement.sequence % COLLECT_EVERY == 0:
             ledger.collect()
         if t is not None and measurement.source == imu and measurement.t_ns >= due:
@@ -171,16 +172,16 @@ def drive(
 
 
 class Ledger:
-    """What became of every event of one run, by the last word on it; `drive` keeps it."""
+    """The final outcome of every event of one run; `drive` keeps it."""
 
     def __init__(self, fusion: Fusion) -> None:
         self.fusion, self._edge = fusion, 0
         self._parts: list[Rows] = []
 
     def collect(self, last: bool = False) -> None:
-        """Take what has settled since; everything at the `last` call."""
+        """Take the rows that no late event can change any more; all rows at the `last` call."""
         history = self.fusion.history
-        edge = history.applied_ns - (0 if last else SETTLED_NS)
+        edge = history.applied_ns - (0 if last else MAX_LATE_NS)
         self._parts.append(history.rows[(history.rows["t_ns"] > self._edge) & (history.rows["t_ns"] <= edge)].copy())
         self._edge = edge
 

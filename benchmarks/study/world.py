@@ -1,5 +1,5 @@
-"""A drive that meets the filter's model exactly: the vehicle slips as the non-holonomic constraint is configured to expect,
-every noise is white and of the configured size, biases and scale walk as configured, mount and biases are drawn.
+"""A drive that matches the filter's model exactly: the vehicle slips as configured for the non-holonomic constraint, every
+noise is white and of the configured size, biases and scale walk as configured, mount and biases are drawn at random.
 
 The motion is that of `fusiond.simulation`, with a slip on top: velocities sideways and down whose values at the instants
 of the constraint are independent draws, joined smoothly in between, felt by the accelerometer and carried into position.
@@ -26,8 +26,8 @@ from fusiond.simulation.gnss import gauss_markov
 from fusiond.simulation.scenario import Imu, Scenario
 from fusiond.simulation.trajectory import Kinematics, Trajectory, blend, turned
 from fusiond.simulation.truth import Motion, inertial
+from fusiond.units import SECOND, nanoseconds
 
-SECOND = 1_000_000_000  # ns
 T0 = 1_760_000_000 * SECOND
 WHEEL_PHASE_S = 0.0013  # wheels report beside the IMU's instants
 IMU_KEYS = ("accel_noise", "gyro_noise", "accel_bias_sigma", "gyro_bias_sigma", "accel_bias_walk", "gyro_bias_walk")
@@ -38,9 +38,9 @@ IMU_NAME, GNSS_NAME = "imu0", "gps0"
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What chance decides before the drive."""
+    """Random values that are drawn before the drive."""
 
-    calibrations: Array  # (WIDE_SIZE - CALIBRATIONS,): the truth of the error states of the installation, as they lie there
+    calibrations: Array  # (WIDE_SIZE - CALIBRATIONS,): true values of the installation, in the order of the error states
 
     @property
     def mount(self) -> Array:
@@ -49,12 +49,12 @@ class Drawn:
 
     @property
     def antenna(self) -> Array:
-        """What the lever arm (3,) [m] is more than configured."""
+        """Difference (3,) [m] of the true lever arm from the configured one."""
         return self.calibrations[ANTENNA_ERROR.start - CALIBRATIONS : ANTENNA_ERROR.stop - CALIBRATIONS]
 
     @property
     def delays(self) -> tuple[float, float]:
-        """How long before its stamp a GNSS position was true, and the velocity [s]."""
+        """Delays from measurement to stamp [s] of GNSS position and velocity."""
         position, more = self.calibrations[DELAYS_ERROR.start - CALIBRATIONS : DELAYS_ERROR.stop - CALIBRATIONS]
         return float(position), float(position + more)
 
@@ -155,7 +155,7 @@ class World:
         walk = settings.wheel_scale_walk / np.sqrt(self.sensor.rate_hz) if settings.wheel_scale_sigma else 0.0
         self.groups = wheel_groups(self.config)
         states = {scale_state(group) for group in {0, *self.groups.values()}}
-        self.calibrations = np.tile(self.drawn.calibrations, (len(self.t), 1))  # and as they walk
+        self.calibrations = np.tile(self.drawn.calibrations, (len(self.t), 1))  # with their random walk
         for state in sorted(states):
             self.calibrations[:, state - CALIBRATIONS] += np.cumsum(walk * self.random.standard_normal(len(self.t)))
 
@@ -193,9 +193,9 @@ def ecef(latitude: Array, longitude: Array, height: Array) -> Array:
 class Fault:
     """What goes wrong with a source, in [start, stop) seconds.
 
-    scale: readings times `size` (a wheel slips; 0: it is silent). jump: the position `size` m to the north. drift: it
-    leaves at `size` m/s to the north, and the velocity says the same. creep: likewise, but the velocity stays right.
-    stuck: the last good message again and again. absent: none. noisy: white noise of `size` configured sigmas on top.
+    scale: readings times `size` (a wheel slips; 0: it reads zero). jump: the position is `size` m too far north. drift: it
+    moves north at `size` m/s, and so does the velocity. creep: the same, but the velocity stays right. stuck: the last good
+    message is repeated. absent: no messages. noisy: additional white noise of `size` configured sigmas.
     """
 
     source: str
@@ -206,12 +206,12 @@ class Fault:
 
 
 def held(t: Array, inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Index (N,) of each message's content: its own, while inside that of the last one before."""
+    """Index (N,) of each message's content: its own, but inside the fault that of the last message before it."""
     return np.maximum.accumulate(np.where(inside, 0, np.arange(len(t))))
 
 
 class Sensors:
-    """Makes the measurements of a world, late where they are late, in the order of their receipt."""
+    """Makes the measurements of a world, with their delays, in the order of receipt."""
 
     def __init__(
         self, world: World, wheel_hz: float = 50.0, gnss_latency_s: float = 0.1, faults: tuple[Fault, ...] = ()
@@ -220,7 +220,7 @@ class Sensors:
         self.wheel_hz, self.gnss_latency_s = wheel_hz, gnss_latency_s
 
     def measurements(self, gnss_from: float = 0.0) -> list[Measurement]:
-        """Everything, sorted by the instant of receipt; GNSS only from a time [s] on."""
+        """All measurements, sorted by receipt; GNSS only from a time [s] on."""
         found: list[Measurement] = []
         world = self.world
         rows = zip(world.accel.tolist(), world.gyro.tolist(), strict=True)
@@ -229,20 +229,20 @@ class Sensors:
             self._gnss(found, name, gnss_from)
         t = world.times(1 / self.wheel_hz, WHEEL_PHASE_S)
         for name, wheel in self.config.wheel.items():
-            noise = self._alike(len(t), 1 / self.wheel_hz, wheel.correlation_s)[:, 0]
+            noise = self._noise(len(t), 1 / self.wheel_hz, wheel.correlation_s)[:, 0]
             scale = 1 + np.interp(t, world.t, world.calibrations[:, scale_state(world.groups[name]) - CALIBRATIONS])
             speed = world.wheel_speed(wheel, t)
             turning = (np.abs(speed) >= wheel.least_mps) & (speed != 0)
             readings = np.where(turning, scale * speed + wheel.sigma_mps * noise, 0.0)
             for fault in self._of(name):
                 readings = self._spoilt(fault, t, readings, wheel.sigma_mps)
-            told = np.abs(readings) if wheel.unsigned else readings
-            self._add(found, name, t, [WheelSpeed(v) for v in told.tolist()], 0.0)
+            signal = np.abs(readings) if wheel.unsigned else readings
+            self._add(found, name, t, [WheelSpeed(v) for v in signal.tolist()], 0.0)
         found.sort(key=lambda m: (m.t_receive_ns, m.t_ns, m.source))
         return found
 
-    def _alike(self, count: int, interval: float, correlation: float) -> Array:
-        """Noise (count, 3) of unit variance that stays alike over `correlation` [s]; white for 0."""
+    def _noise(self, count: int, interval: float, correlation: float) -> Array:
+        """Noise (count, 3) of unit variance with a correlation time [s]; white for 0."""
         return gauss_markov(count, interval, correlation, self.random) if correlation else self._white(count)
 
     def _white(self, count: int) -> Array:
@@ -294,8 +294,8 @@ class Sensors:
         """Of a receiver's positions (N, 3) [m] and velocities (N, 3) [m/s], north-east-down."""
         gnss = self.config.gnss[name]
         sigma = np.array([gnss.position_sigma_m, gnss.position_sigma_m, gnss.height_sigma_m])
-        position = self._alike(len(t), gnss.interval_s, gnss.position_correlation_s) * sigma
-        return position, self._alike(len(t), gnss.interval_s, gnss.velocity_correlation_s) * gnss.velocity_sigma_mps
+        position = self._noise(len(t), gnss.interval_s, gnss.position_correlation_s) * sigma
+        return position, self._noise(len(t), gnss.interval_s, gnss.velocity_correlation_s) * gnss.velocity_sigma_mps
 
     def _add(
         self,
@@ -307,7 +307,7 @@ class Sensors:
         fault_of: str | None = None,
     ) -> None:
         absent = [fault for fault in self._of(fault_of or source) if fault.kind == "absent"]
-        stamps, delay = T0 + np.rint(t * 1e9).astype(np.int64), round(late * 1e9)
+        stamps, delay = T0 + np.rint(t * SECOND).astype(np.int64), nanoseconds(late)
         for k, (stamp, payload) in enumerate(zip(stamps.tolist(), payloads, strict=True)):
             if not any(fault.start <= t[k] < fault.stop for fault in absent):
                 found.append(Measurement(stamp, source, k, stamp + delay, payload))

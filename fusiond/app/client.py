@@ -21,8 +21,8 @@ import msgspec
 import zenoh
 import zenoh.ext
 
-from fusiond.config.schema import Encoding
-from fusiond.config.schema import Zenoh as ZenohSection
+from fusiond.config.outputs import Encoding
+from fusiond.config.outputs import Zenoh as ZenohSection
 from fusiond.messages.codec import decode
 from fusiond.messages.keys import key
 from fusiond.messages.types import ConfigMessage, HealthMessage, InfoMessage, InnovationMessage, Message, StateMessage

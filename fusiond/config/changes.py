@@ -1,4 +1,4 @@
-"""What of a new configuration a running daemon can take, and what it must refuse."""
+"""Which changes of the configuration a running daemon accepts, and which need a restart."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Changes(NamedTuple):
 
 
 def changes(old: Config, new: Config) -> Changes:
-    """How two configurations differ. With anything refused, nothing is to be taken."""
+    """How two configurations differ. If any key is refused, none is taken."""
     found = list(_differences(old, new))
     live = LIVE | {table: kind.live for table, kind in sensor_tables().items()}
     refused = tuple(".".join(key) for key in found if key[-1] not in live.get(key[0], ()))

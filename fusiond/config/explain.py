@@ -1,18 +1,19 @@
-"""What a configuration will do, in words, and what is odd about it."""
+"""A configuration in words: what it does, and probable mistakes in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fusiond.config.schema import MILLISECOND, Config
+from fusiond.config.schema import Config
 from fusiond.config.sensor import point_in_words
 from fusiond.events import GnssPosition, Vector3, WheelSpeed
+from fusiond.units import MILLISECOND
 
 FAR_M = 20.0  # a lever arm beyond this is probably given in other units
 
 
 def description(config: Config) -> Iterator[str]:
-    """The lines of a listing for the person who installs the vehicle."""
+    """The lines of the listing that `fusiond check` prints."""
     settings, motion = config.filter, config.motion
     yield f"vehicle      {config.vehicle.name}"
     for link, mavlink in config.mavlink.items():
@@ -62,7 +63,7 @@ def _zenoh(config: Config) -> str:
 
 
 def oddities(config: Config) -> Iterator[str]:
-    """What is allowed, but probably not meant."""
+    """What is allowed but probably a mistake."""
     payloads = {source.stream.payload for source in config.streams().values()}
     if GnssPosition not in payloads:
         yield "no [gnss.NAME]: without a position the filter never starts"
@@ -87,7 +88,7 @@ def oddities(config: Config) -> Iterator[str]:
 
 
 def _delays(config: Config) -> Iterator[tuple[str, float]]:
-    """The delay of each stream in use [ms], after the words for it."""
+    """Each stream in use, in words, and its delay [ms]."""
     for table, name, _, stream, delay_ns in config.streams().values():
         if stream.enabled:
             which = f" ({stream.suffix.removeprefix('.')})" if stream.suffix else ""

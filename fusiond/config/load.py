@@ -1,4 +1,4 @@
-"""Reading the configuration: a TOML file to its tables, and what may not stand together in them."""
+"""Reading the configuration: from a TOML file to its tables, and the contradictions between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def parse(text: str, path: Path = Path("config.toml")) -> Config:
 
 
 def _contradictions(config: Config) -> Iterator[tuple[str, str]]:
-    """What the types cannot say: references between tables, and combinations that make no sense."""
+    """What types cannot express: references between tables, and combinations that make no sense."""
     yield from _contradictions_on_counts(config)
     yield from _contradictions_on_sensors(config)
     yield from _contradictions_on_can(config)
@@ -40,8 +40,8 @@ def _contradictions(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _contradictions_on_sensors(config: Config) -> Iterator[tuple[str, str]]:
-    names: dict[str, str] = {}  # of the sensors so far: their tables
-    origins: dict[tuple[str, str], str] = {}  # of a table, what is read there, and by whom
+    names: dict[str, str] = {}  # of the sensors so far, with their tables
+    origins: dict[tuple[str, str], str] = {}  # table and origin: the sensor that reads it
     for table, name, section in config.sensors():
         for key, complaint in section.contradictions():
             yield ".".join(filter(None, (table, name, key))), complaint

@@ -1,4 +1,4 @@
-"""The tables of the configuration: keys, units, defaults and bounds."""
+"""The whole configuration: the sections of the filter, the inputs and the sensors, and what follows from all together."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, get_args, get_origi
 
 from msgspec import Meta, field
 
+from fusiond.config.outputs import (
+    Autopilot,
+    Foxglove,
+    GroundStation,
+    Mcap,
+    Prometheus,
+    Publish,
+    Record,
+    Ros2,
+    Zenoh,
+)
 from fusiond.config.sensor import (
     INERTIAL,
     Sensor,
@@ -18,23 +29,18 @@ from fusiond.config.sensor import (
     point_in_words,
     vector_in_words,
 )
-from fusiond.config.toml import Name, Section
+from fusiond.config.toml import Name, NotNegative, Positive, Section, Vector
 from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Pressure, WheelSpeed
+from fusiond.units import MILLISECOND
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
 Seconds = Annotated[float, Meta(gt=0, le=1_000_000)]
 Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
 Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
-Vector = tuple[float, float, float]
-MILLISECOND = 1_000_000  # ns
 WHEEL_DISTANCE = "WHEEL_DISTANCE"  # the MAVLink message of all wheels
 CAN_KEYS = ("message", "signal")  # of a wheel that comes by CAN
 GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
 STAMPS = {"sensor": "by its own stamp", "arrival": "by its arrival"}
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
-Encoding = Literal["json", "msgpack"]
-Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a name without blanks, not starting with a slash")]
 PressureMessage = Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"]
 Checksum = Literal["toyota", "honda", "hyundai", "tesla"]
 GnssMessage = Literal["GPS_RAW_INT", "GPS2_RAW"]
@@ -57,7 +63,7 @@ class Filter(Section, frozen=True, kw_only=True):
     restart_gap_s: Seconds = 30.0  # after a gap of this length in the data the filter aligns again
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good measurements that pass the innovation gate
     gnss_reset_s: Seconds = 30.0  # GNSS rejected for this long with a consistent offset is trusted again
-    gnss_return_s: Seconds = 3.0  # likewise, where no fix was fused in the 10 s before
+    gnss_return_s: Seconds = 3.0  # the same, if no fix was fused in the 10 s before
     v_max_mps: Positive = 60.0  # top speed of the vehicle: the initial velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # heading at the first start, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading
@@ -167,8 +173,8 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     delay_ms: Milliseconds = 0.0  # how long before its stamp the position was measured
     velocity_delay_ms: Milliseconds = 0.0  # additional delay of the velocity (receivers smooth it)
     lever_arm_sigma_m: NotNegative = 0.0  # initial sigma of the lever arm, per axis; 0: not estimated
-    delay_sigma_ms: NotNegative = 0.0  # likewise, of the delay
-    velocity_delay_sigma_ms: NotNegative = 0.0  # likewise, of the velocity delay
+    delay_sigma_ms: NotNegative = 0.0  # initial sigma of the delay; 0: not estimated
+    velocity_delay_sigma_ms: NotNegative = 0.0  # the same, of the velocity delay
     stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's stamp, use the receipt less delay_ms
     position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and a lower bound to what it gives
     height_sigma_m: Positive = 3.0  # the same, vertical
@@ -399,39 +405,11 @@ class Wheel(Sensor, frozen=True, kw_only=True):
             yield "scale", "must not be 0"
 
 
-class Publish(Section, frozen=True, kw_only=True):
-    """[publish]"""
-
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # publications a second, of receive time
-    on_imu: bool = False  # each publication waits up to half a period for the next IMU sample
-    settled_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # `settled` states a second, at most; 0: none
-    innovations: bool = True  # publish the innovation and outcome of every measurement
-    encoding: Encoding = "json"  # "json" or "msgpack"
-
-
-class Zenoh(Section, frozen=True, kw_only=True):
-    """[zenoh]: where the state is published. Loopback and no scouting by default."""
-
-    mode: Literal["peer", "client", "router"] = "peer"  # a client needs a router, a peer does not
-    listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # endpoints to listen on
-    connect: list[str] = field(default_factory=list)  # endpoints to connect to
-    multicast_scouting: bool = False  # discovery on the local network
-    config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
-
-
 class Live(Section, frozen=True, kw_only=True):
     """[live]: how `fusiond run` treats its inputs."""
 
     queue_frames: Annotated[int, Meta(ge=16, le=1_000_000)] = 1024  # capacity of each input's queue; when full it is thinned
     reopen_max_s: Annotated[float, Meta(gt=0, le=600)] = 5.0  # longest pause before a lost input is opened again
-
-
-class Record(Section, frozen=True, kw_only=True):
-    """[record]: the black box of `fusiond run`: all received frames, as .tlog and candump .log."""
-
-    folder: str | None = None  # such as "/var/lib/fusiond/box"; none: nothing is recorded
-    file_mb: Annotated[float, Meta(ge=0.01, le=100_000)] = 64.0  # size at which a new file is begun
-    total_mb: Annotated[float, Meta(ge=0.02, le=10_000_000)] = 1024.0  # beyond this the oldest files are deleted
 
 
 class State(Section, frozen=True, kw_only=True):
@@ -440,80 +418,6 @@ class State(Section, frozen=True, kw_only=True):
     file: str | None = None  # such as "/var/lib/fusiond/state.json"; none: every start is a cold one
     every_s: Annotated[float, Meta(ge=1, le=86400)] = 10.0  # interval between writes; it is also written at the end
     max_age_s: Annotated[float, Meta(gt=0, le=1e9)] = 604800.0  # an older state is ignored; default: a week
-
-
-class Mcap(Section, frozen=True, kw_only=True):
-    """[mcap]: MCAP files of everything published, for Foxglove; needs the extra `mcap`."""
-
-    folder: str | None = None  # such as "/var/lib/fusiond/mcap"; none: nothing is written
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # states a second, at most; none: every one
-    file_mb: Annotated[float, Meta(ge=0.5, le=100_000)] = 64.0  # size, about, at which a new file is begun
-    total_mb: Annotated[float, Meta(ge=1, le=10_000_000)] = 1024.0  # beyond this the oldest files are deleted
-
-
-class Foxglove(Section, frozen=True, kw_only=True):
-    """[foxglove]: a WebSocket server that Foxglove connects to; needs the extra `foxglove`."""
-
-    enabled: bool = False  # serve
-    host: str = "127.0.0.1"  # address to listen on; there is no access control
-    port: Annotated[int, Meta(ge=0, le=65535)] = 8765  # TCP port; 0: any that is free
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = 20.0  # states a second, at most
-
-
-class Ros2(Section, frozen=True, kw_only=True):
-    """[ros2]: what ROS 2 nodes with rmw_zenoh can subscribe to, without ROS here; needs the extra `ros2`."""
-
-    enabled: bool = False  # publish
-    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID
-    namespace: Annotated[str, Meta(pattern=r"^(/|(/[A-Za-z_][A-Za-z0-9_]*)+)$")] = "/"  # of the node and its topics
-    node: Name = "fusiond"  # name of the node
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 50.0  # states a second, at most
-    map_frame: Frame = "map"  # east-north-up at the origin; the pose in it jumps when the filter corrects itself
-    odom_frame: Frame = "odom"  # the pose in it drifts, but never jumps
-    base_frame: Frame = "base_link"  # at the IMU, with axes forward-left-up
-    origin: Vector | None = None  # of the map frame: latitude, longitude [deg], height; none: the first position
-    tf: bool = True  # publish the transforms of map, odom and base_link; false where another node does
-    type_hashes: bool = True  # as in ROS 2 Iron and later; false for Humble, which has none
-    mode: Literal["client", "peer"] = "client"  # a client needs a router (rmw_zenohd), a peer does not
-    connect: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # Zenoh endpoints to connect to
-    listen: list[str] = field(default_factory=list)  # Zenoh endpoints to listen on, as a peer
-    config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
-
-
-class Prometheus(Section, frozen=True, kw_only=True):
-    """[prometheus]: metrics for Prometheus, over HTTP at /metrics; needs the extra `prometheus`."""
-
-    enabled: bool = False  # serve
-    host: str = "127.0.0.1"  # address to listen on; there is no access control
-    port: Annotated[int, Meta(ge=0, le=65535)] = 9464  # TCP port; 0: any that is free
-
-
-class Autopilot(Section, frozen=True, kw_only=True):
-    """[autopilot]: the state sent back to the autopilot as an input of its estimator, live; off without a link."""
-
-    link: Name | None = None  # the [mavlink.LINK] of the autopilot; none: nothing is sent
-    kind: Literal["ardupilot", "px4"] = "ardupilot"  # the autopilot whose rules the messages follow
-    message: Literal["odometry", "gps_input", "vision_position"] = "odometry"  # PX4 does not accept gps_input
-    rate_hz: Annotated[float, Meta(ge=4, le=200)] = 30.0  # messages a second; at most publish.rate_hz
-    dead_reckoning: bool = True  # send while dead reckoning too, within the limits below
-    position_sigma_m: Positive = 5.0  # nothing is sent beyond this horizontal position sigma, north or east
-    velocity_sigma_mps: Positive = 1.0  # nor beyond this velocity sigma
-    yaw_sigma_deg: Positive = 15.0  # nor beyond this yaw sigma
-    age_ms: Positive = 500.0  # nor when the last IMU sample is older
-    set_origin: bool = False  # send the local origin to the autopilot, as long as it has none of its own
-    gps_id: Annotated[int, Meta(ge=0, le=1)] = 1  # the receiver that gps_input stands for: 0 is the first, 1 the second
-
-
-class GroundStation(Section, frozen=True, kw_only=True):
-    """[ground_station]: telemetry, events and answers for a ground station, live; off without link and connection."""
-
-    link: Name | None = None  # send over this [mavlink.LINK]; the autopilot routes it
-    connection: str | None = None  # or over a connection of its own, such as "udpout:192.168.1.10:14550"
-    baud: Annotated[int, Meta(gt=0)] = 115200  # of that connection, for serial devices
-    system: Annotated[int, Meta(ge=0, le=255)] = 0  # own system id on that connection; 0: that of the autopilot
-    component: Annotated[int, Meta(ge=1, le=255)] = 191  # own component id on that connection (191: onboard computer)
-    rate_hz: Annotated[float, Meta(ge=0.1, le=100)] = 4.0  # position and attitude messages a second
-    marker_system: Annotated[int, Meta(ge=0, le=255)] = 0  # system id of a vehicle that marks the state on the map; 0: none
 
 
 class ConfiguredSensor(NamedTuple):
@@ -531,7 +435,7 @@ class Source(NamedTuple):
     name: str
     section: Sensor
     stream: Stream
-    delay_ns: int  # of the stream, with that of the bus
+    delay_ns: int  # of the stream, with the delay of the bus
 
 
 class Config(Section, frozen=True, kw_only=True):
@@ -565,7 +469,7 @@ class Config(Section, frozen=True, kw_only=True):
         return Path(self.directory) / name
 
     def sensors(self, **by: str) -> Iterator[ConfiguredSensor]:
-        """Every sensor, by kind in the order of the tables above; of one input alone with `link="NAME"` or `bus="NAME"`."""
+        """Every sensor, by kind in the order of the tables above. `link="NAME"` or `bus="NAME"` selects one input."""
         for table in sensor_tables():
             named: dict[str, Sensor] = getattr(self, table)
             for name, section in named.items():
@@ -573,7 +477,7 @@ class Config(Section, frozen=True, kw_only=True):
                     yield ConfiguredSensor(table, name, section)
 
     def streams(self) -> dict[str, Source]:
-        """Every source of measurements, by its name, in the order of `sensors`. KeyError where a bus is missing."""
+        """Every source of measurements by its name, in the order of `sensors`. KeyError if a bus is not configured."""
         found = {}
         for table, name, section in self.sensors():
             bus = section.inputs().get("bus")
@@ -584,13 +488,13 @@ class Config(Section, frozen=True, kw_only=True):
         return found
 
     def sources(self) -> tuple[str, ...]:
-        """The names of the sources of measurements, in the order that breaks ties of time."""
+        """The names of the sources of measurements, in the order that breaks ties between equal stamps."""
         return tuple(sorted(name + stream.suffix for _, name, section in self.sensors() for stream in section.streams()))
 
 
 @cache
 def sensor_tables() -> dict[str, type[Sensor]]:
-    """The tables of Config that describe sensors, with the kind of each: those whose type is a dict of Sensor."""
+    """The tables of Config that describe sensors, with the kind of each: the fields that are a dict of Sensor."""
     hints = get_type_hints(Config)
     kinds = {table: get_args(hint)[1] for table, hint in hints.items() if get_origin(hint) is dict}
     return {table: kind for table, kind in kinds.items() if issubclass(kind, Sensor)}
@@ -600,8 +504,8 @@ MAX_SCALES = 4
 
 
 def wheel_groups(config: Config) -> dict[str, int]:
-    """For each wheel the number of its scale, which it shares with all wheels, with those of its axle, or with none.
-    Axles are counted from the rear, wheels by name."""
+    """The number of each wheel's scale. All wheels share one, or those of an axle, or none do. Axles are numbered from the
+    rear, wheels by name."""
     by = config.filter.wheel_scale_by
     keys = {name: {"vehicle": 0, "axle": wheel.position_m[0], "wheel": name}[by] for name, wheel in config.wheel.items()}
     order = sorted(set(keys.values()), key=lambda key: (isinstance(key, str), key))
@@ -609,5 +513,5 @@ def wheel_groups(config: Config) -> dict[str, int]:
 
 
 def calibrated(gnss: Gnss) -> bool:
-    """Whether the filter estimates anything of a receiver's installation."""
+    """Whether the filter estimates a receiver's lever arm or delays."""
     return max(gnss.lever_arm_sigma_m, gnss.delay_sigma_ms, gnss.velocity_delay_sigma_ms) > 0

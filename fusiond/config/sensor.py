@@ -2,65 +2,69 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from typing import ClassVar, NamedTuple
 
 from fusiond.config.toml import Section
 from fusiond.events import Payload, Vector3
 
-INERTIAL = "imu"  # stands for an observation model in the stream that carries the state forward
+INERTIAL = "imu"  # in place of an observation model: the stream that propagates the state
 INPUTS = {"link": "mavlink", "bus": "can"}  # the key by which a sensor names its input: the table of those inputs
 
 
 class Stream(NamedTuple):
-    """One stream of measurements that a sensor gives. The source's name is the sensor's with the suffix."""
+    """One stream of measurements of a sensor. The name of the source is that of the sensor with the suffix."""
 
-    model: str  # the observation model that it feeds, or INERTIAL
+    model: str  # name of its observation model, or INERTIAL
     payload: type[Payload]
-    delay_ms: float  # how long before its stamp a sample was measured; the delay of its bus is added
+    delay_ms: float  # time from the measurement to the stamp; the delay of the bus is added
     suffix: str = ""
     enabled: bool = True  # False: the configuration turns the stream off
     correlation_s: float = 0.0  # correlation time of its errors
     sigma: float = 0.0  # configured for one sample, in the unit of the model
-    group: str | None = None  # sensors of one group share part of their error
+    group: str | None = None  # sensors of one group have part of their error in common
     shared_sigma: float = 0.0  # that part, in the same unit
     noise_min: float = 1.0  # the sigma is learnt, down to this multiple of the configured one
     noise_max: float = 1.0  # and up to this
-    outlier_share: float = 0.0  # share of samples that are outliers, weighed by their likelihood; 0: they are gated
+    outlier_share: float = 0.0  # share of outliers, which are weighted by their likelihood; 0: outliers are gated
     companion: str | None = None  # suffix of another stream of this sensor: this one is trusted only while that one is
 
 
 class Sensor(Section, frozen=True, kw_only=True):
-    """A table [KIND.NAME] that describes a sensor. What the rest of the program must know of the kind, it asks here."""
+    """A table [KIND.NAME] that describes a sensor: its keys, and what the rest of the program needs to know of its kind.
+
+    Every kind defines the methods marked abstract; a test checks that it does.
+    """
 
     label: ClassVar[str]  # the kind in words, at most 12 characters
     required: ClassVar[bool] = False  # exactly one is needed
-    only_one: ClassVar[str | None] = None  # why there can be one at most
+    only_one: ClassVar[str | None] = None  # why there can be at most one
     point: ClassVar[str | None] = None  # the key of the sensor's position from the IMU [m]
-    live: ClassVar[frozenset[str]] = frozenset({"rate_hz", "interval_s"})  # a running daemon can take new values of these
+    live: ClassVar[frozenset[str]] = frozenset({"rate_hz", "interval_s"})  # keys that a running daemon can change
 
+    @abstractmethod
     def streams(self) -> tuple[Stream, ...]:
         """The streams that it gives."""
-        raise NotImplementedError
 
+    @abstractmethod
     def messages(self) -> dict[str, float]:
-        """The messages of its link or bus that it reads, each with the rate [Hz] to ask for; 0 on a bus."""
-        raise NotImplementedError
+        """The messages of its link or bus that it reads, each with the rate [Hz] to request; 0 on a bus."""
 
     def origin(self) -> str:
         """What it reads, in words. Two sensors of one kind must not read the same."""
         return f"{', '.join(self.messages())} of {', '.join(self.inputs().values())}"
 
+    @abstractmethod
     def description(self, name: str) -> Iterator[str]:
-        """What it will do, in words; the first line follows the label and the name."""
-        raise NotImplementedError
+        """What it does, in words. The first line follows the label and the name."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Keys that cannot stand together: the key ("" for the whole table), and what is wrong."""
+        """Keys that contradict each other: the key ("" for the whole table), and what is wrong."""
         return iter(())
 
     def inputs(self) -> dict[str, str]:
-        """The inputs that it comes by: the keys of INPUTS that it has, with the names that stand there."""
+        """The inputs that carry it: the keys of INPUTS that it has, and their values."""
         names = {key: getattr(self, key, None) for key in INPUTS}
         return {key: name for key, name in names.items() if name is not None}
 

@@ -1,4 +1,4 @@
-"""A TOML file to typed, frozen structs; an error names the file, the line, the key and what is allowed."""
+"""From a TOML file to typed, frozen structs. An error names the file, the line, the key and what is allowed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from msgspec import Meta, Struct
 
 from fusiond.errors import UsageError
 
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="letters, digits, underscore")]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="a name of letters, digits and underscores")]
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Vector = tuple[float, float, float]
 
 
 class ConfigError(UsageError):
@@ -39,7 +42,7 @@ Table = TypeVar("Table", bound=Section)
 
 
 def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
-    """Check the text of a TOML file against a struct; `given` are fields no file may set. Raises ConfigError."""
+    """Check the text of a TOML file against a struct. `given` are fields that no file may set. Raises ConfigError."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -55,13 +58,13 @@ def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
 
 
 def refuse(complaints: Iterable[tuple[str, str]], text: str, path: Path) -> None:
-    """Raise ConfigError for the first of the complaints (dotted key, what is wrong), if there is one."""
+    """Raise ConfigError for the first complaint (dotted key, what is wrong), if there is one."""
     for key, complaint in complaints:
         raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
 
 
 def _not_finite(value: object, key: str = "") -> Iterator[str]:
-    """The dotted keys of the numbers, in a table or array of them, that TOML calls inf or nan."""
+    """The dotted keys of all numbers in a table or array that are inf or nan."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from _not_finite(inner, f"{key}.{name}" if key else name)
@@ -95,17 +98,30 @@ def _explain(
         entries = table[inside]
         assert isinstance(entries, dict)
         key = f"{inside}.{next(name for name in entries if not re.fullmatch('[A-Za-z0-9_]+', name))}"
-    if "matching regex" in what:
-        what = "a name is made of letters, digits and underscores"
+        what = f"must be {_descriptions(Name)[0]}"
+    elif "matching regex" in what:
+        what = f"must be {_descriptions(_type_of(kind, key))[0]}"
     return f"{path}:{_line_of(key, text)}: {key or 'the file'}: {what}"
 
 
 def _choices(kind: type[Section], key: str) -> list[str]:
     """The values that an enumerated key may have."""
+    return [str(choice) for choice in _literals(_type_of(kind, key))]
+
+
+def _type_of(kind: type[Section], key: str) -> object:
+    """The type of the field that a dotted key names; None if there is no such field."""
     *tables, last = key.split(".")
     here = _kind_at(kind, tables)
     types = {item.name: item.type for item in msgspec.structs.fields(here)} if here else {}
-    return [str(choice) for choice in _literals(types.get(last))]
+    return types.get(last)
+
+
+def _descriptions(hint: object) -> list[str]:
+    """What the patterns of a type describe."""
+    if isinstance(hint, Meta):
+        return [hint.description] if hint.description else []
+    return [description for inner in get_args(hint) for description in _descriptions(inner)]
 
 
 def _literals(hint: object) -> list[object]:
@@ -115,7 +131,7 @@ def _literals(hint: object) -> list[object]:
 
 
 def _resolve(inside: str, message: str, table: dict[str, object], kind: type[Section]) -> str:
-    """msgspec writes `[...]` for a table's name: find the name whose content has the fault."""
+    """msgspec writes `[...]` in place of a table's name: find the name of the table with the error."""
     if "[...]" not in inside:
         return inside
     head, tail = inside.split("[...]", 1)
@@ -132,7 +148,7 @@ def _resolve(inside: str, message: str, table: dict[str, object], kind: type[Sec
 
 
 def _kind_at(kind: type[Section], parts: list[str]) -> type[Section] | None:
-    """The struct whose keys may stand below a dotted key, through arrays of tables and tables of named tables."""
+    """The struct at a dotted key, through arrays of tables and tables of named tables."""
     here: type[Section] | None = kind
     named = False
     for part in parts:
@@ -153,7 +169,7 @@ def _section_in(hint: object) -> tuple[type[Section] | None, bool]:
 
 
 def _line_of(key: str, text: str) -> int:
-    """The line on which a dotted key, or else the nearest table above it, stands; 1 if none does."""
+    """The line of a dotted key, or of the nearest table above it; 1 if neither is in the text."""
     parts = key.split(".")
     table, best, depth = "", 1, 0
     counts: dict[str, int] = {}  # of the tables in an array so far

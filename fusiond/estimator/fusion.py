@@ -1,4 +1,4 @@
-"""Fusion: events in, outcomes and estimates out. The one door to the core; live and replay differ in who calls it."""
+"""Fusion of one vehicle: events in, outcomes and solutions out. Live and replay use it in the same way."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from msgspec import Struct
 
 from fusiond.config.schema import Config, Imu
 from fusiond.estimator.history import History
-from fusiond.estimator.solution import COVARIANCE_SIZE, Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import COVARIANCE_SIZE, Mode, Solution, SolutionState
 from fusiond.events import ImuSample, Invalid, Measurement, Received, Vector3
 from fusiond.filter.hot_start import leading, leads
 from fusiond.filter.kernel.interpreted import AnyKernel
 from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations import IMU, MODELS
 from fusiond.filter.observations.model import Unusable, within
-from fusiond.filter.parameters import SECOND, model_of, nanoseconds, plan
+from fusiond.filter.parameters import model_of, plan
 from fusiond.filter.rows import Outcome
 from fusiond.filter.source_health import Belief, belief
 from fusiond.filter.state import (
@@ -46,22 +46,23 @@ from fusiond.filter.state import (
 )
 from fusiond.filter.stored_state import StoredState, check, stored_state
 from fusiond.timeline.clock import Clock
+from fusiond.units import SECOND, nanoseconds
 
-LOST_IMU_NS = 5 * SECOND  # without an inertial sample for so long the state is called lost
+LOST_IMU_NS = 5 * SECOND  # the mode is lost when the newest inertial sample is older than this
 
 
 class Receipt(Struct, frozen=True, gc=False):
-    """What became of an event that was received."""
+    """The outcome of an event that was received."""
 
     measurement: Measurement
     history: History
-    refusal: Outcome | None = None  # INVALID, TOO_OLD or DUPLICATE; None where it stands in the history
-    reason: str = ""  # of INVALID
+    refusal: Outcome | None = None  # INVALID, TOO_OLD or DUPLICATE; None if the event is in the history
+    reason: str = ""  # why it is INVALID
 
     @property
     def outcome(self) -> Outcome:
-        """By now: what stands in the history is judged again when another event comes before it. Asking has the history
-        judge it; LookupError where it is forgotten there, long after the horizon."""
+        """The outcome so far: it can change when an earlier event arrives late. Reading it makes the history run the
+        rows that are due. LookupError if the history has dropped the event, long after the horizon."""
         return self.history.outcome(self.measurement) if self.refusal is None else self.refusal
 
 
@@ -69,31 +70,31 @@ class Fusion:
     """Clock, history and filter of one vehicle, by its configuration."""
 
     def __init__(self, config: Config, compiled: bool | None = None, stored: StoredState | None = None) -> None:
-        """`compiled` asks for the compiled kernel or its NumPy twin; by default the compiled one where it was built.
-        `stored` is what an earlier run left for a hot start; StoredStateError where it is not for this configuration."""
+        """`compiled` selects the compiled kernel or its NumPy twin; the default is the compiled one if it was built.
+        `stored` is the state of an earlier run, for a hot start; StoredStateError if it does not fit the configuration."""
         if stored is not None:
             check(stored, config)
         self.config = config
         self.plan = plan(config, stored)
         self.clock = Clock(config)
         self.history = History(self.plan, compiled)
-        self._carried = FilterState(len(self.plan.sources), self.plan.size)  # the head, beyond the newest inertial sample
-        self._rows: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {
+        self._predicted = FilterState(len(self.plan.sources), self.plan.size)  # the head, predicted to an instant
+        self._encoders: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {  # payload and section to numbers
             source: (imu_values if (model := model_of(found.stream)) == IMU else MODELS[model].values, found.section)
             for source, found in config.streams().items()
         }
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
 
-    def receive(self, received: Received) -> Receipt | None:
-        """Align one event, put it where it belongs in time, and fuse it. None for events that teach the clock only.
+    def feed(self, received: Received) -> Receipt | None:
+        """Align an event and fuse it. None for an event that only informs the clock.
 
         The source must be one of the configuration's; ValueError otherwise.
         """
         measurement = self.clock.align(received)
-        return None if measurement is None else self.take(measurement)
+        return None if measurement is None else self.fuse(measurement)
 
-    def take(self, measurement: Measurement) -> Receipt:
-        """Fuse an event that is aligned already."""
+    def fuse(self, measurement: Measurement) -> Receipt:
+        """Fuse an event that is already aligned. ValueError if its source is not configured."""
         history, source = self.history, self.history.index.get(measurement.source)
         if source is None:
             raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.plan.sources)}")
@@ -105,32 +106,32 @@ class Fusion:
             return Receipt(measurement, history, history.count(source, Outcome.INVALID), reason)
         return Receipt(measurement, history, history.offer(source, measurement, values))
 
-    def estimate_at(self, t_ns: int) -> Estimate:
-        """The estimate at an instant, from all that was received: the head carried there on the newest IMU sample. An
-        instant before the head's gives the head itself."""
-        self._carried.copy_from(self.history.head)
-        state = self._published(self._carried)
+    def solution_at(self, t_ns: int) -> Solution:
+        """The solution at an instant, from everything received so far: the head, predicted to the instant with the newest
+        IMU sample. An instant before the head's gives the head itself."""
+        self._predicted.copy_from(self.history.head)
+        state = self._published(self._predicted)
         self.history.kernel.predict(state, t_ns)
-        return self._estimate(state, t_ns)
+        return self._solution(state, t_ns)
 
-    def settled(self) -> Estimate:
-        """The estimate at the horizon, which no late event can change any more."""
+    def settled(self) -> Solution:
+        """The solution at the horizon, which no late event can change any more."""
         state = self._published(self.history.settled())
-        return self._estimate(state, int(state.stamps[T]))
+        return self._solution(state, int(state.stamps[T]))
 
     def hot_start(self) -> Verdict:
-        """What became of the stored state."""
+        """The result of checking the stored state."""
         return Verdict(int(self.history.head.stamps[HOT_START]))
 
     def to_store(self) -> StoredState | None:
-        """The newest state, for a hot start of the next run; None while there is none."""
+        """The newest state, for a hot start of the next run; None before alignment is complete."""
         head = self.history.head
         if leads(head, self.plan):
             head = leading(head)
         return stored_state(head, self.config) if head.stamps[PHASE] == RUNNING else None
 
     def outcomes(self) -> dict[str, dict[str, int]]:
-        """Counts of outcomes by source, by the last word on each event."""
+        """Counts of outcomes by source. An event counts with its latest outcome."""
         return {
             source: {outcome.name: int(self.history.counts[i, outcome]) for outcome in Outcome}
             for i, source in enumerate(self.plan.sources)
@@ -140,8 +141,8 @@ class Fusion:
         """Counts of outcomes over all sources."""
         return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
 
-    def beliefs(self, t_ns: int) -> dict[str, Belief]:
-        """What each source is held to be at an instant (THEORY D1, D2)."""
+    def health(self, t_ns: int) -> dict[str, Belief]:
+        """The health of each source at an instant (docs/theory.md, D1 and D2)."""
         head = self.history.head
         start = int(head.stamps[T_START])
         return {
@@ -150,33 +151,34 @@ class Fusion:
         }
 
     def _values(self, measurement: Measurement) -> tuple[float, ...]:
-        """A payload as a row of numbers. Raises Unusable."""
+        """The numbers of a payload for the kernel. Raises Unusable."""
         payload = measurement.payload
         if isinstance(payload, Invalid):
             raise Unusable(payload.reason)
-        to_values, section = self._rows[measurement.source]
+        to_values, section = self._encoders[measurement.source]
         values = to_values(payload, section)
         if not math.isfinite(sum(values)):
             raise Unusable("not finite")
         return values
 
     def _published(self, state: FilterState) -> FilterState:
-        """What is published of a state: while a bank is sure of a stored heading, the hypothesis of that."""
+        """The state to publish: the leading hypothesis where a bank is sure of a stored heading, else the state itself."""
         return leading(state) if leads(state, self.plan) else state
 
-    def _estimate(self, state: FilterState, t_ns: int) -> Estimate:
+    def _solution(self, state: FilterState, t_ns: int) -> Solution:
+        """The solution that a filter state gives at an instant."""
         stamps, resets = state.stamps, int(state.stamps[RESETS])
         age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
         if stamps[PHASE] != RUNNING:
-            return Estimate(t_ns, Mode.ALIGNING, age, resets, None)
-        answer = state_estimate(state, self.history.kernel)
-        north, east, _ = answer.sigma_position_n()
+            return Solution(t_ns, Mode.ALIGNING, age, resets, None)
+        published = solution_state(state, self.history.kernel)
+        north, east, _ = published.sigma_position_n()
         mode = Mode.NOMINAL
         if math.hypot(north, east) > self.plan.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
             mode = Mode.LOST
         elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.plan.filter.position_timeout_s):
             mode = Mode.DEAD_RECKONING
-        return Estimate(t_ns, mode, age, resets, answer)
+        return Solution(t_ns, mode, age, resets, published)
 
 
 def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
@@ -186,20 +188,20 @@ def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
     return sample.specific_force_b + sample.angular_rate_b
 
 
-def state_estimate(state: FilterState, kernel: AnyKernel) -> StateEstimate:
-    """A running filter state in north-east-down, as it is published."""
+def solution_state(state: FilterState, kernel: AnyKernel) -> SolutionState:
+    """A filter state after alignment, in north-east-down, for publication."""
     x, auxiliary = state.nominal, state.auxiliary
     numbers = kernel.answer(x, state.covariance)
-    told, nominal = numbers[: COVARIANCE_N.start].tolist(), x.tolist()
+    published, nominal = numbers[: COVARIANCE_N.start].tolist(), x.tolist()
     rate, force = auxiliary[RATE_B].tolist(), auxiliary[FORCE_B].tolist()
     gyro_bias, accel_bias = nominal[GYRO_BIAS_B], nominal[ACCEL_BIAS_B]
     sigma = [math.sqrt(max(variance, 0.0)) for variance in state.covariance.diagonal().tolist()]
-    return StateEstimate(
-        latitude=told[0],
-        longitude=told[1],
-        height=told[2],
-        velocity_n=_three(told[VELOCITY_N]),
-        quaternion_nb=tuple(told[QUATERNION_NB]),
+    return SolutionState(
+        latitude=published[0],
+        longitude=published[1],
+        height=published[2],
+        velocity_n=_three(published[VELOCITY_N]),
+        quaternion_nb=tuple(published[QUATERNION_NB]),
         angular_rate_b=(rate[0] - gyro_bias[0], rate[1] - gyro_bias[1], rate[2] - gyro_bias[2]),
         acceleration_b=(force[0] - accel_bias[0], force[1] - accel_bias[1], force[2] - accel_bias[2]),
         gyro_bias=_three(gyro_bias),

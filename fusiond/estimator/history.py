@@ -1,17 +1,17 @@
 """Every event of the last `horizon` in order of (t_ns, source, sequence), with snapshots of the whole filter state.
 
-Theory of operation. An event is inserted where its key belongs, and that is all until somebody looks at the head, the rows
-or the counts: only then are the rows run, those of many events at once. The rows [0, applied) are in the head state. Where
-an event is inserted among them, the snapshots from the first row on that it changes are dropped, and the head is restored
-from the newest that is left before the rows after it are run again. So head and outcomes are a function of the set of
-events alone, whatever the order of their arrival, and whenever somebody looked.
+Theory of operation. An event becomes a row of the event table, inserted in order. The rows are not run yet: that is done
+when the head, the rows or the counts are read, for many events at once. The head state contains the rows [0, applied). If
+an event is inserted among them, the snapshots that contain a changed row are dropped, the head is restored from the newest
+one left, and the rows after it are run again. So head and outcomes are a function of the set of events alone: neither the
+order of arrival nor the instants of reading matter.
 
-Which rows does an event change? All after it; and if it is an IMU sample, also those between it and the IMU sample before
-it, because they interpolate between the two. Therefore a snapshot is taken only after an IMU row, or where the IMU has been
-silent for so long that no later sample can change what went before.
+Which rows does an event change? All rows after it. An IMU sample also changes the rows between it and the IMU sample
+before it, because they interpolate between the two. Therefore a snapshot is taken only after an IMU row, or once the IMU
+has been silent for longer than `imu_gap`: the filter coasts then, and no later sample changes what went before.
 
-Which rows are applied when somebody looks? Those up to the newest IMU sample; and if the IMU has gone silent, those older
-by `imu_gap` than the newest event of all, so that the filter coasts on with its other sensors.
+Which rows are run? Those up to the newest IMU sample. If the IMU has gone silent, also those older by `imu_gap` than the
+newest event, so that the filter coasts on with its other sensors.
 """
 
 from __future__ import annotations
@@ -29,26 +29,27 @@ from fusiond.filter.step import run_one
 
 FIRST_ROWS = 4096
 FIRST_SNAPSHOTS = 64
-FORGET_EVERY = 256  # events; so many are run at once at the most
+FORGET_EVERY = 256  # events; at most this many are run at once
 
 
 class History:
-    """The events of the horizon and the filter state behind them."""
+    """The events of the horizon and the filter state that they lead to."""
 
     def __init__(self, plan: Plan, compiled: bool | None = None) -> None:
         self.plan = plan
         self.kernel = make_kernel(plan, compiled)
         self.index = {source: i for i, source in enumerate(plan.sources)}
         self.rerun = 0  # rows run again because of a late event
-        self.applied_ns = NEVER  # up to where events are applied: a function of the stamps received alone
-        self.settled_ns = NEVER - plan.horizon_ns  # no event older than this is taken any more
+        self.applied_ns = NEVER  # events up to here are applied; it depends on the received stamps alone
+        self.settled_ns = NEVER - plan.horizon_ns  # the horizon: an older event is TOO_OLD
         self._head = FilterState(len(plan.sources), plan.size)
         self._counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
-        self._lags = [0 if model == IMU else plan.imu_gap_ns for model in plan.models]  # of what is applied behind an event
+        # by source: an event makes the rows older than it by this due [ns]
+        self._lags = [0 if model == IMU else plan.imu_gap_ns for model in plan.models]
         self._table: Rows = np.zeros(FIRST_ROWS, dtype=ROW)
         self._begin = self._end = 0  # the live part of the table
-        self._applied = 0  # rows of the live part that are in the head; where it is rewound, in the newest snapshot
-        self._behind = self._rewound = False  # whether there are rows to run, and the head is to be restored before
+        self._applied = 0  # rows of the live part in the head; after a rewind, in the newest snapshot
+        self._pending = self._rewound = False  # there are rows to run; the head must be restored first
         self._snapshots = Snapshots(self._head)
         self._attach()
         self._until_forgetting = FORGET_EVERY
@@ -59,24 +60,25 @@ class History:
 
     @property
     def head(self) -> FilterState:
-        """The state after every event up to `applied_ns`. The same object ever: ask again after an event."""
-        self.catch_up()
+        """The state after every event up to `applied_ns`. Always the same object: read it again after an event."""
+        self.apply_rows()
         return self._head
 
     @property
     def rows(self) -> Rows:
         """The live rows, oldest first."""
-        self.catch_up()
+        self.apply_rows()
         return self._table[self._begin : self._end]
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """Number of events (sources, outcomes), by the last word on each. The same array ever: ask again after an event."""
-        self.catch_up()
+        """Number of events (sources, outcomes), each with its latest outcome. Always the same array: read it again after an
+        event."""
+        self.apply_rows()
         return self._counts
 
     def offer(self, source: int, measurement: Measurement, values: tuple[float, ...]) -> Outcome | None:
-        """Put one event where it belongs in time. Returns the reason why it is not kept, None where it is."""
+        """Insert an event in order. Returns the reason if it is not kept, None if it is."""
         t_ns = measurement.t_ns
         if t_ns < self.settled_ns:
             return self.count(source, Outcome.TOO_OLD)
@@ -88,7 +90,7 @@ class History:
         if first_changed < 0:
             return self.count(source, Outcome.DUPLICATE)
         self._end += 1
-        self._behind = True
+        self._pending = True
         if first_changed < self._applied:
             self._rewind(first_changed)
         reach_ns = t_ns - self._lags[source]
@@ -105,35 +107,34 @@ class History:
         return outcome
 
     def outcome(self, measurement: Measurement) -> Outcome:
-        """What became of an event, by now. LookupError where it is not kept any more."""
+        """The outcome of an event so far. LookupError if the event has been dropped."""
         source, sequence = self.index[measurement.source], measurement.sequence
-        self.catch_up()
+        self.apply_rows()
         place = self.kernel.place(self._begin, self._end, measurement.t_ns, source, sequence)
         if place < 0:
             return Outcome(self._table["outcome"][self._begin + ~place])
         raise LookupError(f"no event of {measurement.source} at {measurement.t_ns} is kept")
 
     def settled(self) -> FilterState:
-        """The newest snapshot that no event still to come can change: the state about a snapshot interval before the
-        horizon."""
+        """The newest snapshot that no later event can change: the state about one snapshot interval before the horizon."""
         self._forget()
         return self._snapshots.first()
 
     def _rewind(self, first_changed: int) -> None:
-        """Have the rows run again from the newest snapshot on that holds no changed one."""
+        """Drop the snapshots that contain a changed row, so that the rows after the newest one left are run again."""
         before, self._applied = self._applied, self._snapshots.rewind(first_changed)
         self.rerun += before - self._applied
         self._rewound = True
 
-    def catch_up(self) -> None:
-        """Apply the rows up to `applied_ns`. Whoever looks at the state, the rows or the counts has this done."""
-        if not self._behind:
+    def apply_rows(self) -> None:
+        """Run the rows up to `applied_ns`. Reading the head, the rows or the counts does this first."""
+        if not self._pending:
             return
         kept, done = self._snapshots, False
         if self._rewound:
             self.kernel.restore(kept.end)
-        self._behind = self._rewound = False
-        while not done:  # the kernel stops for want of memory, and at a row that is not its own
+        self._pending = self._rewound = False
+        while not done:  # the kernel stops when its memory is full, and at a row that it leaves to Python
             before = self._applied
             self._applied, kept.end, done = self.kernel.run(self._begin, self._end, before, self.applied_ns, kept.end)
             if done:
@@ -157,8 +158,8 @@ class History:
         self._attach()
 
     def _forget(self) -> None:
-        """Drop the rows and snapshots that no event inside the horizon can need. When this is done changes no result."""
-        self.catch_up()
+        """Drop the rows and snapshots that no event inside the horizon can need. The results do not depend on when."""
+        self.apply_rows()
         self._until_forgetting = FORGET_EVERY
         gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
         self._begin += gone
@@ -186,7 +187,7 @@ class Snapshots:
         return state
 
     def rewind(self, first_changed: int) -> int:
-        """Drop the newest ones as long as they hold a changed row. Returns the number of rows in the newest left."""
+        """Drop the newest snapshots that contain a changed row. Returns the number of rows in the newest one left."""
         while self.applied[self.end - 1] > first_changed:
             self.end -= 1
         return int(self.applied[self.end - 1])
@@ -206,8 +207,8 @@ class Snapshots:
         self.begin, self.end = 0, count
 
     def forget(self, stamps: NDArray[np.int64], limit_ns: int) -> int:
-        """Drop the oldest snapshots as long as the next one has an unapplied row older than the limit: every row that it
-        has applied is then as old. Returns how many rows nobody needs any more."""
+        """Drop the oldest snapshots while the first row after the next one is older than the limit: all rows in that one
+        are then older too. Returns how many rows can be dropped."""
         base = self.begin
         while base + 1 < self.end:
             applied = self.applied[base + 1]

@@ -1,4 +1,4 @@
-"""The filter's answer at one instant: what is published, logged and shown, with its covariance."""
+"""The solution at one instant: state, covariance and mode, as published, logged and shown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.events import Vector3
 from fusiond.maths.portable import asin, atan2
 
-# Blocks of `StateEstimate.covariance`
+# Blocks of `SolutionState.covariance`
 POSITION = slice(0, 3)  # m, north-east-down
 VELOCITY = slice(3, 6)  # m/s, north-east-down
 ATTITUDE = slice(6, 9)  # rad, small rotation about north, east, down
@@ -20,19 +20,19 @@ COVARIANCE_SIZE = 9
 
 
 class Mode(enum.StrEnum):
-    """How far the estimate can be trusted."""
+    """How far the state can be trusted."""
 
     ALIGNING = "aligning"  # no state yet
     NOMINAL = "nominal"  # position is being fixed
-    DEAD_RECKONING = "dead_reckoning"  # no position fix for a while; the covariance grows
+    DEAD_RECKONING = "dead_reckoning"  # no recent position fix; the covariance grows
     LOST = "lost"  # the state is not worth using
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StateEstimate:
-    """Nominal state of the filter and its uncertainty; position and velocity are those of the IMU.
+class SolutionState:
+    """The state in north-east-down and its uncertainty. Position and velocity are those of the IMU.
 
-    The covariance is copied and made read-only. Raises ValueError where its shape is not (9, 9).
+    The covariance is copied and made read-only. Raises ValueError if its shape is not (9, 9).
     """
 
     latitude: float  # rad, WGS-84
@@ -40,11 +40,11 @@ class StateEstimate:
     height: float  # m, on the datum of the position source
     velocity_n: Vector3  # m/s
     quaternion_nb: tuple[float, float, float, float]  # w, x, y, z
-    angular_rate_b: Vector3  # rad/s, freed of bias
-    acceleration_b: Vector3  # m/s^2, specific force freed of bias: (0, 0, -9.8) when level and at rest
+    angular_rate_b: Vector3  # rad/s, corrected for bias
+    acceleration_b: Vector3  # m/s^2, specific force corrected for bias: (0, 0, -9.8) when level and at rest
     gyro_bias: Vector3  # rad/s
     accel_bias: Vector3  # m/s^2
-    wheel_scale: float  # what all wheels read too much: 0.01 is 1 %
+    wheel_scale: float  # relative error of all wheels: 0.01 if they read 1 % too high
     mount: tuple[float, float]  # rad, pitch and yaw of the IMU against the vehicle
     covariance: NDArray[np.float64]  # (9, 9), blocks POSITION, VELOCITY, ATTITUDE
     sigma_gyro_bias: Vector3  # rad/s
@@ -74,11 +74,11 @@ class StateEstimate:
         return self._sigma(0), self._sigma(1), self._sigma(2)
 
     def sigma_velocity(self) -> float:
-        """Root mean square of the velocity sigmas north and east [m/s]: the horizontal sigma per axis."""
+        """Horizontal velocity sigma per axis [m/s]: the root mean square of north and east."""
         return math.sqrt((float(self.covariance[3, 3]) + float(self.covariance[4, 4])) / 2)
 
     def sigma_yaw(self) -> float:
-        """Sigma of the rotation about down [rad]: that of the yaw angle, as long as the vehicle is near level."""
+        """Sigma of the rotation about down [rad]: that of the yaw angle while the vehicle is nearly level."""
         return self._sigma(8)
 
     def _sigma(self, index: int) -> float:
@@ -86,16 +86,16 @@ class StateEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
-    """The filter's answer at `t_ns`; `state` is None while there is none (aligning, or lost beyond use)."""
+class Solution:
+    """The solution at `t_ns`; `state` is None before alignment is complete."""
 
     t_ns: int  # the instant it is valid for
     mode: Mode
-    age_ns: int | None  # t_ns less the stamp of the last IMU sample behind it; None before the first sample
-    resets: int  # how often the state was reset (jumped)
-    state: StateEstimate | None
+    age_ns: int | None  # t_ns less the stamp of the last IMU sample used; None before the first sample
+    resets: int  # number of resets so far; the state may jump at each
+    state: SolutionState | None
 
 
 def _half_open(angle: float) -> float:
-    """An angle of [-pi, pi] in (-pi, pi]."""
+    """An angle in [-pi, pi], moved to (-pi, pi]."""
     return math.pi if angle == -math.pi else angle

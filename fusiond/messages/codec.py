@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import msgspec
 
-from fusiond.config.schema import Encoding
+from fusiond.config.outputs import Encoding
 from fusiond.messages.types import MESSAGES, Message
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)

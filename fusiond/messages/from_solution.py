@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import msgspec
 
-from fusiond.estimator.solution import ATTITUDE, POSITION, VELOCITY, Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import ATTITUDE, POSITION, VELOCITY, Mode, Solution, SolutionState
 from fusiond.messages.types import (
     Block,
     OutcomeCounts,
@@ -23,7 +23,7 @@ from fusiond.units import MILLISECOND
 AnyState = TypeVar("AnyState", bound=StateAtInstant)
 
 
-def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
+def state_message(estimate: Solution, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
     """The message of an estimate.
 
     A state with a number that is not finite, or with a negative variance, is withheld: the message then has mode
@@ -32,12 +32,12 @@ def state_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> 
     return _message(StateMessage, estimate, vehicle, outcomes)
 
 
-def settled_message(estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
+def settled_message(estimate: Solution, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
     """The same of an estimate at the horizon."""
     return _message(SettledMessage, estimate, vehicle, outcomes)
 
 
-def _message(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
+def _message(kind: type[AnyState], estimate: Solution, vehicle: str, outcomes: OutcomeCounts) -> AnyState:
     state, fault = _checked(estimate.state) if estimate.state is not None else (None, None)
     return kind(
         vehicle=vehicle,
@@ -51,7 +51,7 @@ def _message(kind: type[AnyState], estimate: Estimate, vehicle: str, outcomes: O
     )
 
 
-def _checked(estimate: StateEstimate) -> tuple[State | None, str | None]:
+def _checked(estimate: SolutionState) -> tuple[State | None, str | None]:
     """The published state, or None and what is wrong with it."""
     if not all(variance >= 0 for variance in estimate.covariance.diagonal().tolist()):
         return None, "covariance: a variance is negative or not a number"
@@ -65,7 +65,7 @@ def _checked(estimate: StateEstimate) -> tuple[State | None, str | None]:
     return state, None
 
 
-def _published(estimate: StateEstimate) -> State:
+def _published(estimate: SolutionState) -> State:
     """The state in the units of the message. Raises ValueError on a negative variance."""
     roll, pitch, yaw = estimate.euler()
     return State(
@@ -113,7 +113,7 @@ def _degrees(angles: tuple[float, float]) -> tuple[float, float]:
     return math.degrees(angles[0]), math.degrees(angles[1])
 
 
-def _block(estimate: StateEstimate, block: slice) -> Block:
+def _block(estimate: SolutionState, block: slice) -> Block:
     """A block of the covariance, made symmetric to the last bit: the rotation into n leaves it asymmetric by rounding."""
     a, b, c, d, e, f, g, h, i = estimate.covariance[block, block].ravel().tolist()
     b, c, f = (b + d) / 2, (c + g) / 2, (f + h) / 2

@@ -39,7 +39,7 @@ from fusiond.messages.types import (
     SourceStatus,
     StateMessage,
 )
-from fusiond.timeline.clock import ClockReport
+from fusiond.timeline.aligner import ClockReport
 
 SECOND = 1_000_000_000  # ns
 RATE_DENOMINATOR = 1_000_000  # a rate is taken as a fraction with at most this, so that ticks never drift
@@ -153,7 +153,7 @@ class Sources:
 
     def health(self, t_ns: int) -> dict[str, SourceHealth]:
         fusion, present = self._fusion, self.present(t_ns)
-        beliefs = fusion.beliefs(t_ns)
+        beliefs = fusion.health(t_ns)
         clocks, nis, counts = fusion.clock.report(), nis_means(fusion), fusion.history.counts.tolist()
         found = {}
         for i, source in enumerate(fusion.plan.sources):
@@ -208,7 +208,7 @@ class Changes:
         self._present = present
         if state.t_ns >= self._look_ns:
             self._look_ns = state.t_ns + LOOK_NS
-            for source, belief in self._fusion.beliefs(state.t_ns).items():
+            for source, belief in self._fusion.health(state.t_ns).items():
                 if belief.status not in ("absent", self._statuses[source]):  # that it is gone is told above
                     self._statuses[source] = belief.status
                     good = belief.status == "nominal"

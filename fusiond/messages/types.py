@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from fusiond.config.schema import Encoding
+from fusiond.config.outputs import Encoding
 from fusiond.estimator.solution import Mode
 
 SCHEMA_VERSION = 1  # raised when a field changes its meaning, its unit or its type, or goes; not when one is added

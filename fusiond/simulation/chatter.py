@@ -1,4 +1,4 @@
-"""What else is on the wires of a simulated drive: messages and frames that the filter has no use for."""
+"""Other traffic of a simulated drive: messages and frames that the filter does not use."""
 
 from __future__ import annotations
 

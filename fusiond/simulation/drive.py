@@ -33,10 +33,11 @@ from fusiond.simulation.wire import (
 )
 from fusiond.units import MICROSECOND, MILLISECOND, SECOND, nanoseconds
 
-WHEEL_PHASE_S, STEERING_PHASE_S, SPEED_PHASE_S, BEACON_PHASE_S = 0.0013, 0.0027, 0.0041, 0.1  # beside whole instants
-PRESSURE_PHASE_S = 0.0119  # likewise
-TELEMETRY_PHASE_S, TRAFFIC_PHASE_S = 0.0007, 0.00037  # of the first; each further kind comes so much later again
-BEACON_SCATTER_S = 0.02  # SYSTEM_TIME and HEARTBEAT go out when the autopilot's scheduler finds the time
+# Offsets of the streams, so that their instants differ.
+WHEEL_PHASE_S, STEERING_PHASE_S, SPEED_PHASE_S, BEACON_PHASE_S = 0.0013, 0.0027, 0.0041, 0.1
+PRESSURE_PHASE_S = 0.0119
+TELEMETRY_PHASE_S, TRAFFIC_PHASE_S = 0.0007, 0.00037  # of the first kind, and between each kind and the next
+BEACON_SCATTER_S = 0.02  # SYSTEM_TIME and HEARTBEAT are sent when the autopilot's scheduler has time
 GENERATORS = (
     *("imu_bias", "imu_noise", "imu_vibration", "gnss_white", "gnss_drift", "gnss_velocity"),
     *WHEELS,
@@ -48,7 +49,7 @@ GENERATORS = (
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What `simulate` gives: the truth at the IMU's instants, and what was received, in the order of receipt."""
+    """The result of `simulate`: the truth at the IMU's instants, and what was received, in the order of receipt."""
 
     scenario: Scenario
     seed: int
@@ -76,7 +77,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """The messages of one stream: when each came to be, how it fared, and whether its sender was awake."""
+    """The messages of one stream: when each was made, how it was carried, and whether its sender was running."""
 
     t_origin_ns: Stamps
     passage: Passage
@@ -211,7 +212,7 @@ def _truth_and_imu(run: _Simulation) -> tuple[Truth, tuple[Array, Array]]:
 
 
 def _telemetry(run: _Simulation) -> dict[str, _Sent]:
-    """What else the autopilot sends, if anything."""
+    """Other messages of the autopilot, if the scenario has them."""
     if not run.scenario.autopilot.telemetry:
         return {}
     found = {}

@@ -60,7 +60,7 @@ def measure(
     t: Array,
     randoms: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> Fixes:
-    """The fixes that tell of the times `t` (N,) [s]; the generators are those of white, drifting and velocity noise."""
+    """The fixes of the instants `t` (N,) [s]. The generators are those of white, drifting and velocity noise."""
     gnss = scenario.gnss
     place, _ = antenna(trajectory, gnss, t)
     velocity = smoothed_velocity(trajectory, gnss, t)
@@ -90,7 +90,7 @@ def smoothed_velocity(trajectory: Trajectory, gnss: Gnss, t: Array) -> Array:
 
 
 def last_before(t: Array, frozen: Mask) -> Integers:
-    """Indices (N,): each its own, while frozen that of the last one before."""
+    """Index (N,) of the fix that each message repeats: its own, but that of the last one before while frozen."""
     own = np.where(frozen, 0, np.arange(len(t)))
     return np.maximum.accumulate(own)
 

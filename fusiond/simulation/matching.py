@@ -12,9 +12,9 @@ from fusiond.simulation.scenario import WHEELS, Barometer, Gnss, Imu, Scenario
 from fusiond.simulation.trajectory import euler_matrix
 from fusiond.simulation.wire import BAROMETER, BUS, GNSS, IMU, LINK
 
-LEAST_NOISE = 1e-5  # a noiseless sensor still needs a sigma
+MIN_NOISE = 1e-5  # a noiseless sensor still needs a sigma
 OWN_SCALE_SPEED = 10.0  # m/s, at which a wheel's own scale error is counted as noise
-OWN_SCALE_LASTS_S = 60.0  # such noise stays alike while the vehicle keeps about its speed
+OWN_SCALE_CORRELATION_S = 60.0  # such an error lasts while the vehicle keeps about its speed
 MOUNT_SIGMA_FLOOR_DEG = 0.5
 SIGNALS = ("SPEED_FL", "SPEED_FR", "SPEED_RL", "SPEED_RR")
 FAULT_SIGNAL, COUNTER_SIGNAL = "FAULT", "COUNTER"
@@ -63,8 +63,8 @@ def _head(scenario: Scenario, dbc_name: str) -> str:
 name = "{scenario.vehicle.name}"  # names the vehicle in every published key
 
 [filter]
-mount_sigma_deg = {mount:g}  # first sigma of the IMU's pitch and yaw against the vehicle [deg]
-wheel_scale_sigma = {max(0.01, abs(scenario.wheels.scale_error)):g}  # first sigma of the common wheel scale (1 = 100 %)
+mount_sigma_deg = {mount:g}  # initial sigma of the IMU's pitch and yaw against the vehicle [deg]
+wheel_scale_sigma = {max(0.01, abs(scenario.wheels.scale_error)):g}  # initial sigma of the common wheel scale (1 = 100 %)
 
 [motion]
 point_m = {_from_imu(scenario, np.zeros(3))}  # the middle of the unsteered axle, on the road
@@ -87,9 +87,9 @@ def _imu(imu: Imu) -> str:
 [imu.{IMU}]
 link = "{LINK}"
 message = "HIGHRES_IMU"
-accel_noise = {max(accel, LEAST_NOISE):.3g}  # noise density, vibration at 10 m/s included [m/s^2/sqrt(Hz)]
-gyro_noise = {max(gyro, LEAST_NOISE):.3g}  # [rad/s/sqrt(Hz)]
-accel_bias_sigma = {_sigma(imu.accel_bias, imu.accel_bias_sigma):.3g}  # first sigma of the bias [m/s^2]
+accel_noise = {max(accel, MIN_NOISE):.3g}  # noise density, vibration at 10 m/s included [m/s^2/sqrt(Hz)]
+gyro_noise = {max(gyro, MIN_NOISE):.3g}  # [rad/s/sqrt(Hz)]
+accel_bias_sigma = {_sigma(imu.accel_bias, imu.accel_bias_sigma):.3g}  # initial sigma of the bias [m/s^2]
 gyro_bias_sigma = {_sigma(imu.gyro_bias, imu.gyro_bias_sigma):.3g}  # [rad/s]
 accel_bias_walk = {imu.accel_bias_walk:.3g}  # random walk of the bias [m/s^2/sqrt(s)]
 gyro_bias_walk = {imu.gyro_bias_walk:.3g}  # [rad/s/sqrt(s)]
@@ -104,9 +104,9 @@ def _barometer(barometer: Barometer) -> str:
     return f"""\
 [barometer.{BAROMETER}]
 link = "{LINK}"
-sigma_m = {max(barometer.sigma_m, LEAST_NOISE):.3g}  # noise of one reading, as a height
-correlation_s = 0.0  # time over which its errors stay alike
-offset_walk_m = {barometer.offset_walk_m:.3g}  # random walk of what it reads too much [m/sqrt(s)]
+sigma_m = {max(barometer.sigma_m, MIN_NOISE):.3g}  # noise of one reading, as a height
+correlation_s = 0.0  # correlation time of its errors
+offset_walk_m = {barometer.offset_walk_m:.3g}  # random walk of its offset [m/sqrt(s)]
 """
 
 
@@ -120,18 +120,18 @@ def _gnss(scenario: Scenario) -> str:
 link = "{LINK}"
 message = "GPS_RAW_INT"
 lever_arm_m = {_from_imu(scenario, np.array(gnss.antenna_m))}  # the antenna
-delay_ms = {_stamp_delay_ms(gnss):g}  # how long before its stamp the position was true
-velocity_delay_ms = {gnss.velocity_lag_ms:g}  # how much longer before it the velocity was true
-position_sigma_m = {max(horizontal, LEAST_NOISE):.3g}  # horizontal, per axis
-height_sigma_m = {max(vertical, LEAST_NOISE):.3g}
-velocity_sigma_mps = {max(gnss.velocity_sigma_mps, LEAST_NOISE):.3g}  # per axis
-position_correlation_s = {share * gnss.correlation_s:.3g}  # time over which position errors stay alike [s]
+delay_ms = {_stamp_delay_ms(gnss):g}  # how long before its stamp the position was measured
+velocity_delay_ms = {gnss.velocity_lag_ms:g}  # how much longer before it the velocity was measured
+position_sigma_m = {max(horizontal, MIN_NOISE):.3g}  # horizontal, per axis
+height_sigma_m = {max(vertical, MIN_NOISE):.3g}
+velocity_sigma_mps = {max(gnss.velocity_sigma_mps, MIN_NOISE):.3g}  # per axis
+position_correlation_s = {share * gnss.correlation_s:.3g}  # correlation time of position errors [s]
 interval_s = {1 / gnss.rate_hz:.6g}  # spacing of the fixes [s]
 """
 
 
 def _stamp_delay_ms(gnss: Gnss) -> float:
-    """What the stamp leaves unsaid: nothing, the way to the autopilot, or the way to the host."""
+    """The delay before the stamp: none, that to the autopilot, or that to the host."""
     link_ms = gnss.transport.latency_ms + gnss.transport.jitter_ms
     return {"unix": 0.0, "boot-arrival": gnss.delay_ms, "none": gnss.delay_ms + link_ms}[gnss.stamp]
 
@@ -139,7 +139,7 @@ def _stamp_delay_ms(gnss: Gnss) -> float:
 def _wheels(scenario: Scenario) -> list[str]:
     spec = scenario.wheels
     own = OWN_SCALE_SPEED * max(abs(error) for error in spec.scale_errors)  # m/s, lasting
-    sigma = max(math.hypot(spec.sigma_mps, own), LEAST_NOISE)
+    sigma = max(math.hypot(spec.sigma_mps, own), MIN_NOISE)
     tables = []
     for name, signal, place in zip(WHEELS, SIGNALS, wheels.positions_v(scenario), strict=True):
         tables.append(f"""\
@@ -148,13 +148,13 @@ bus = "{BUS}"
 message = "{wheels.FRAME_NAME}"
 signal = "{signal}"
 unit = "km/h"
-unsigned = {str(spec.unsigned).lower()}  # tells the amount only
+unsigned = {str(spec.unsigned).lower()}  # amount only, no direction
 valid_signal = "{FAULT_SIGNAL}"  # must be valid_value, 0
 counter_signal = "{COUNTER_SIGNAL}"  # a repeated value marks a stale frame
 position_m = {_from_imu(scenario, place)}  # its contact point
 steered = {str(name.startswith("front")).lower()}  # it measures the speed along its own track
 sigma_mps = {sigma:.3g}  # of a reading
-correlation_s = {(own / sigma) ** 2 * OWN_SCALE_LASTS_S:.3g}  # time over which its errors stay alike [s]
+correlation_s = {(own / sigma) ** 2 * OWN_SCALE_CORRELATION_S:.3g}  # correlation time of its errors [s]
 quantum_mps = {spec.resolution_kmh / 3.6:.3g}  # step of the signal
 """)
     return tables

@@ -13,8 +13,7 @@ from typing import Annotated, Literal, get_args
 
 from msgspec import Meta, field
 
-from fusiond.config.schema import NotNegative, Positive, Vector
-from fusiond.config.toml import Name, Section, decode, read_text, refuse
+from fusiond.config.toml import Name, NotNegative, Positive, Section, Vector, decode, read_text, refuse
 
 Degrees = Annotated[float, Meta(ge=-360, le=360)]
 Interval = tuple[float, float]  # [start, stop) s

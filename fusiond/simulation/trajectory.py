@@ -64,7 +64,7 @@ class Kinematics:
 
 
 class Trajectory:
-    """The drive of a scenario; times are seconds from its start, held inside the drive."""
+    """The drive of a scenario; times are seconds from its start, limited to the drive."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._script(scenario)

@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """How N messages fared: when each left, when it was received [ns, true Unix time], and whether it was at all.
+    """The transport of N messages: when each left, when it arrived [ns, true Unix time], and whether it arrived at all.
 
     Where messages keep their order the jitter is that of the sender's schedule, else that of the way.
     """
@@ -51,7 +51,7 @@ class BootClock:
         self._rate = 1 + autopilot.drift_ppm * 1e-6
 
     def session(self, t_ns: Stamps) -> Stamps:
-        """Which boot each time belongs to, counted from 0."""
+        """The number of the boot at each time, from 0."""
         found: Stamps = np.maximum(np.searchsorted(self._boots, t_ns, side="right") - 1, 0)
         return found
 

@@ -1,4 +1,4 @@
-"""What really happened: the navigation state and what a perfect inertial sensor would read, at the IMU's instants."""
+"""The truth at the IMU's instants: the navigation state, and the readings of a perfect inertial sensor."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Truth:
     gyro_bias_b: Array  # (N, 3) rad/s
     accel_bias_b: Array  # (N, 3) m/s^2
     speed: Array  # (N,) m/s, of the rear axle along the vehicle's forward axis
-    wheel_scale: tuple[float, float, float, float]  # what each wheel reads too much, 0.01 = 1 %
+    wheel_scale: tuple[float, float, float, float]  # relative error of each wheel: 0.01 if it reads 1 % too high
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The part of the truth which the trajectory alone decides; fields as in `Truth`."""
+    """The part of the truth that depends on the trajectory alone; fields as in `Truth`."""
 
     position: tuple[Array, Array, Array]
     velocity_n: Array

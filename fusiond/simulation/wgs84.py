@@ -1,4 +1,4 @@
-"""WGS-84 for whole arrays: radii, gravity, rates; apart from `fusiond.maths.wgs84`, so that each checks the other."""
+"""WGS-84 for whole arrays: radii, gravity, rates; independent of `fusiond.maths.wgs84`, so that each checks the other."""
 
 from __future__ import annotations
 
@@ -47,5 +47,5 @@ def shifted(latitude: Array, longitude: Array, height: Array, offset_n: Array) -
 
 
 def wrapped(angle: Array) -> Array:
-    """Angles [rad] brought into [-pi, pi)."""
+    """Angles [rad] wrapped to [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -18,7 +18,7 @@ from fusiond.simulation.transport import Mask, within
 Integers = NDArray[np.int64]
 FRAME_ID, FRAME_NAME = 0x1D0, "WHEEL_SPEEDS"
 SPEED_BITS, FAULT_BIT, COUNTER_BITS = 15, 3, 3
-RUBBISH = 0x7FFF  # what the speeds read while the fault bit is set
+INVALID_RAW = 0x7FFF  # what the speeds read while the fault bit is set
 STEERING_ID, STEERING_HZ = 0x025, 80.0
 SPEED_ID, SPEED_HZ = 0x0B4, 40.0
 STEERING_RATIO = 15.0  # steering wheel over front wheels
@@ -40,7 +40,7 @@ def true_speeds(scenario: Scenario, kinematics: Kinematics) -> Array:
 
 
 def scales(wheels: Wheels) -> tuple[float, float, float, float]:
-    """What each wheel reads too much, common and own error together."""
+    """The relative error of each wheel, common and own error together."""
     first, second, third, fourth = ((1 + wheels.scale_error) * (1 + own) - 1 for own in wheels.scale_errors)
     return first, second, third, fourth
 
@@ -62,10 +62,10 @@ def measure(
         held = np.flatnonzero(within(t, [(stuck.start_s, stuck.stop_s)]))
         column[held] = column[held[:1]]
     low, high = (0, RAW_MAX_UNSIGNED) if wheels.unsigned else (-RAW_MAX_SIGNED, RAW_MAX_SIGNED)
-    told = np.abs(speeds) if wheels.unsigned else speeds
-    raw = np.clip(np.rint(told * 3.6 / wheels.resolution_kmh), low, high).astype(np.int64)
+    signal = np.abs(speeds) if wheels.unsigned else speeds
+    raw = np.clip(np.rint(signal * 3.6 / wheels.resolution_kmh), low, high).astype(np.int64)
     fault = within(t, wheels.fault_s)
-    raw[fault] = RUBBISH if wheels.unsigned else RAW_MAX_SIGNED
+    raw[fault] = INVALID_RAW if wheels.unsigned else RAW_MAX_SIGNED
     return raw, fault
 
 
@@ -73,7 +73,7 @@ def frames(raw: Integers, fault: Mask, counter: Integers) -> NDArray[np.uint64]:
     """The eight bytes of each frame (N,), as big-endian numbers."""
     word = np.zeros(len(raw), np.uint64)
     for column in range(4):
-        word = (word << np.uint64(SPEED_BITS)) | (raw[:, column] & RUBBISH).astype(np.uint64)
+        word = (word << np.uint64(SPEED_BITS)) | (raw[:, column] & INVALID_RAW).astype(np.uint64)
     status = (fault.astype(np.uint64) << np.uint64(FAULT_BIT)) | counter.astype(np.uint64)
     return (word << np.uint64(FAULT_BIT + 1)) | status
 

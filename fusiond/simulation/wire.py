@@ -125,7 +125,7 @@ class TimeMessages:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeats:
-    """HEARTBEAT, which makes no event."""
+    """HEARTBEAT; it gives no event."""
 
     t_receive_us: Stamps
     counter: Stamps
@@ -133,13 +133,13 @@ class Heartbeats:
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """One of the messages that an autopilot sends besides, of no use to the filter."""
+    """Another message of the autopilot, which the filter does not use."""
 
     message: str
     t_receive_us: Stamps
     counter: Stamps
     boot_ms: Stamps
-    row: Stamps  # of the truth that it tells
+    instant: Stamps  # index of the truth that it reports
 
 
 @dataclass(frozen=True, slots=True)

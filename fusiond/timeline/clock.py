@@ -1,346 +1,29 @@
-"""One time line for all sources: a pure function of the (sensor stamp, receive stamp) pairs seen so far.
+"""One time line for all sources: that of the receiving host's clock.
 
-The time line is that of the receiving host's clock. Every clock that sensors stamp with (`Received.clock`) has one
-`_Aligner`, shared by all sources that read it, so that the quickest message serves them all. Each stamp is shifted,
-t = stamp + shift(stamp) - the source's delay; the shift is steered towards an aim:
-
-no stamp       t = receipt - delay.
-unix           trusted as it is (aim 0) while receipt - stamp is plausible: -FUTURE_TOLERANCE to PLAUSIBLE_LATENCY. The
-               first stamp decides, so each has its result at once; trust is lost only by three stamps in a row over
-               TRUST_LOST_AFTER, and regained by a plausible re-alignment, or when the least offset creeps back. Without
-               it: least offset. A host ahead by less than PLAUSIBLE_LATENCY cannot be distinguished from a slow link.
-boot + trips   (TIMESYNC) boot to the host's line by round trips, see `RoundTrips`; while that is plausible against the
-               least offset. Together with pairs it also gives the host's offset from Unix time, which is then the aim
-               of Unix stamps, trusted or not: so a host whose clock is wrong puts both where they belong.
-boot + pairs   (SYSTEM_TIME) boot to Unix by the least of Unix less boot, as boot is cut off to a millisecond; while
-               Unix is trusted and the result is plausible against the least offset; else least offset.
-least offset   the least receipt - stamp of the clock, as a line with drift: see `OffsetFloor`.
-
-The shift is a continuous, piecewise linear function of the sensor's stamp: it slews towards the aim by at most 1/20 of
-elapsed sensor time (1/2 in the first second), and what is laid down is never altered. So order and intervals survive
-(for stamps over 4 ns apart), a late fix is treated like the IMU sample of its own time, and a duplicate gets the very
-same t_ns.
-
-A stamp that does not fit is judged by where it lies:
-in the future  by more than FUTURE_TOLERANCE; latency cannot do that. Invalid, unless a second in a row agrees.
-fallen         late by over PLAUSIBLE_LATENCY and FALL behind the newest stamp: a reboot, or a stray. Invalid, likewise.
-late           by as much, without a fall: a stalled link, or the host was set forward. Keeps its alignment; if it stays
-               equally late for 2 s of both clocks (10 s where it is only SLOW), the clock has moved.
-What stamps of one source agree on re-aligns the clock at once: a new epoch, counted, which may step either way. A stamp
-of any source that fits ends every streak; a repeated one adds nothing. Invalid payloads are stamped, but not learnt from.
+A stamp is t = aligned stamp - the source's delay; without a stamp, t = receipt - delay. Every clock that sensors stamp
+with (`Received.clock`) has one `Aligner`, shared by all sources that read it, so that the quickest message serves them
+all. Invalid payloads are stamped, but nothing is learnt from them.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, replace
-from enum import Enum, auto
-from typing import Literal
-
 from fusiond.config.schema import Config
 from fusiond.events import HOST_CLOCK, UNIX_CLOCK, ClockPair, Invalid, Measurement, Received
-from fusiond.timeline.least_offset import OffsetFloor
-from fusiond.timeline.timesync import RoundTrips
-
-MILLISECOND = 1_000_000  # ns
-SECOND = 1_000 * MILLISECOND  # ns
-BILLION = 10**9  # a rate of one, in parts per billion
-
-FUTURE_TOLERANCE = 50 * MILLISECOND  # an aligned stamp may lie this far after its receipt (host against GNSS time)
-PLAUSIBLE_LATENCY = 2 * SECOND  # a stamp later than this (boot clock: beyond what is usual for its source) does not fit
-FALL = SECOND  # a stamp this far behind the newest one is no matter of order
-SLOW = 100 * MILLISECOND  # beyond the source's usual lateness: a congested link, or a clock has moved, if it lasts
-CONSISTENT = 250 * MILLISECOND  # consecutive stamps agree on a new offset within this
-PAIR_TOLERANCE = 20 * MILLISECOND  # a clock pair off by more is odd; two odd ones that agree start anew
-TRUST_LOST_AFTER = 1_500 * MILLISECOND  # of stamps that contradict, without one that fits
-
-PIECE = 50 * MILLISECOND  # least length of a linear piece of the shift
-PIECES = 256  # kept, so that old stamps find theirs: 6 s and more
-STEP = 250 * MILLISECOND  # an aim farther off than this (and than slewing reaches) is stepped to: a re-alignment
+from fusiond.timeline.aligner import Aligner, ClockReport
 
 ABSURD = "sensor stamp is not positive"
 
-Method = Literal["arrival", "unix", "timesync", "system_time", "least_offset"]
-
-
-@dataclass(frozen=True, slots=True)
-class ClockReport:
-    """How one clock is aligned. `note` says why a better method is not in use."""
-
-    method: Method
-    offset_ns: int  # time line less the clock's stamp, latest
-    drift_ppm: float  # how much faster the host's clock runs, by receipts
-    jitter_ns: int  # mean of receipt less aligned stamp, since the last re-alignment
-    resets: int  # re-alignments after a jump or reboot
-    strays: int  # stamps that came out invalid
-    samples: int
-    note: str = ""
-
-
-class _Verdict(Enum):
-    FITS = auto()
-    FUTURE = auto()
-    FALLEN = auto()
-    LATE = auto()
-    SLOW = auto()
-
-
-FITS = _Verdict.FITS  # what nearly all stamps do
-_REASONS = {_Verdict.FUTURE: "stamped in the future", _Verdict.FALLEN: "clock jump"}
-_CONFIRMATION = {  # consecutive stamps that agree, and the time that they span on both clocks
-    _Verdict.FUTURE: (2, 0),
-    _Verdict.FALLEN: (2, 0),
-    _Verdict.LATE: (3, 2 * SECOND),
-    _Verdict.SLOW: (3, 10 * SECOND),
-}
-
-
-@dataclass(slots=True)
-class _Streak:
-    """Consecutive stamps of one source that do not fit and agree on another offset."""
-
-    verdict: _Verdict  # the first one's
-    first_receive: int
-    first_stamp: int
-    last_stamp: int
-    offset: int  # least receipt less stamp
-    late: int  # least lateness
-    count: int = 1
-
-    def continued(self, verdict: _Verdict, receive: int, offset: int) -> bool:
-        same = (verdict is _Verdict.FUTURE) == (self.verdict is _Verdict.FUTURE)
-        return same and receive >= self.first_receive and abs(offset - self.offset) <= CONSISTENT
-
-
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """A linear piece of the shift from stamp `start` to `end`, constant beyond."""
-
-    start: int
-    end: int
-    shift: int  # at the start
-    rate: int = 0  # ppb
-    step: bool = False  # not joined to the piece before it
-
-    def at(self, stamp: int) -> int:
-        elapsed = (stamp if stamp < self.end else self.end) - self.start
-        return self.shift + (elapsed * self.rate // BILLION if elapsed > 0 else 0)
-
-
-class _Aligner:
-    """Places the stamps of one clock. `unix` is the Unix clock's aligner, None in that one itself."""
-
-    def __init__(self, unix: _Aligner | None) -> None:
-        self.samples = self.resets = self.strays = 0
-        self.complaint = ""  # why pairs are not used
-        self._unix = unix
-        self._pieces: deque[_Piece] = deque(maxlen=PIECES)
-
-    def _begin(self, stamp: int, receive: int, offset: int) -> None:
-        """Forget everything; from here on, receipt less stamp is `offset` or more."""
-        self._floor = OffsetFloor(receive, offset)
-        self._streaks: dict[str, _Streak] = {}
-        self._pairs: OffsetFloor | None = None  # unix less boot
-        self._odd_pair: int | None = None
-        self._trips = RoundTrips()
-        self.synchronised = False  # by round trips
-        self.bridge: int | None = None  # of the Unix clock: its offset by way of a synchronised boot clock
-        self.trusted = self._unix is None and -FUTURE_TOLERANCE <= offset <= PLAUSIBLE_LATENCY  # boot: see learn_pair
-        self._restart(_Piece(stamp, stamp, self._aim(receive)), stamp)
-
-    def _restart(self, piece: _Piece, stamp: int) -> None:
-        self._pieces.clear()
-        self._pieces.append(piece)
-        self._usual: dict[str, int] = {}  # least lateness of each source, where not 0
-        self._epoch = self._newest = stamp
-        self._latency = self._placed = 0
-
-    @property
-    def begun(self) -> bool:
-        """Whether any stamp has come yet."""
-        return bool(self._pieces)
-
-    def floor_at(self, receive: int) -> int:
-        """The least offset, where any stamp has come."""
-        return self._floor.at(receive)
-
-    @property
-    def anchored(self) -> bool:
-        """Whether the aim comes from round trips or Unix time, not from receipts."""
-        if self.synchronised or self.bridge is not None:
-            return True
-        return self.trusted and (self._unix is None or self._unix.trusted)
-
-    def _aim(self, receive: int) -> int:
-        floor = self._floor.at(receive)
-        if self._unix is None and not self.trusted:
-            self.trusted = 0 <= floor <= PLAUSIBLE_LATENCY
-        if not self.anchored:
-            return floor
-        aim = self._trips.at(receive) if self.synchronised else self.bridge
-        if aim is None:
-            aim = self._pairs.at(receive) if self._pairs else 0
-        return min(aim, floor + FUTURE_TOLERANCE)
-
-    def place(self, source: str, stamp: int, receive: int) -> int | str:
-        """The stamp on the time line, or why it is invalid. Learns from it."""
-        offset = receive - stamp
-        self.samples += 1
-        if not self._pieces:
-            self._begin(stamp, receive, offset)
-        last = self._pieces[-1]
-        piece = last if last.start <= stamp <= last.end else self._piece(stamp, receive)
-        aligned = stamp + piece.at(stamp)
-        late = receive - aligned
-        usual = self._usual.get(source, 0) if self._usual else 0
-        verdict = FITS if -FUTURE_TOLERANCE <= late <= SLOW else self._judge(stamp, late, usual)
-        if verdict is FITS:
-            if self._streaks or late < usual:
-                self._fits(source, late)
-            self._floor.add(receive, offset)
-        elif (agreed := self._agreed(verdict, source, stamp, receive, late)) is not None:
-            self.resets += 1
-            self._begin(stamp, receive, agreed)
-            last = piece = self._pieces[-1]
-            aligned = stamp + piece.shift
-        elif verdict in _REASONS:
-            self.strays += 1
-            return _REASONS[verdict]
-        if verdict is _Verdict.SLOW:
-            self._floor.add(receive, offset)
-        if piece.step:
-            self.resets += 1
-            self._restart(replace(piece, step=False), stamp)
-        elif piece is not last and piece.end > last.end:
-            self._pieces.append(piece)
-        if stamp > self._newest:
-            self._newest = stamp
-        self._latency += receive - aligned
-        self._placed += 1
-        return aligned
-
-    def peek(self, stamp: int, receive: int) -> int:
-        """The stamp on the time line if it fits there, else the receipt. Learns nothing."""
-        if self._pieces:
-            aligned = stamp + self._piece(stamp, receive).at(stamp)
-            if -FUTURE_TOLERANCE <= receive - aligned <= PLAUSIBLE_LATENCY:
-                return aligned
-        return receive
-
-    def _piece(self, stamp: int, receive: int) -> _Piece:
-        """The piece that holds a stamp; one that would continue the last, if none does yet."""
-        pieces = self._pieces
-        last = pieces[-1]
-        if stamp <= last.end:
-            return last if stamp >= last.start else next((p for p in reversed(pieces) if stamp >= p.start), pieces[0])
-        start, shift = self._newest, last.at(self._newest)  # none was placed after it
-        end = max(stamp, start + PIECE)
-        reach = (end - start) // (2 if start - self._epoch < SECOND else 20)
-        gap = self._aim(receive) - shift
-        if abs(gap) > max(reach, STEP):
-            return _Piece(stamp, end, shift + gap, step=True)
-        return _Piece(start, end, shift, max(-reach, min(reach, gap)) * BILLION // (end - start))
-
-    def _judge(self, stamp: int, late: int, usual: int) -> _Verdict:
-        if late < -FUTURE_TOLERANCE:
-            return _Verdict.FUTURE
-        anchored = self.anchored
-        excess = late if anchored else late - usual
-        if excess <= PLAUSIBLE_LATENCY:
-            return FITS if anchored or excess <= SLOW else _Verdict.SLOW
-        return _Verdict.FALLEN if stamp < self._newest - usual - FALL else _Verdict.LATE
-
-    def _fits(self, source: str, late: int) -> None:
-        """The clock has not moved: what is slow meanwhile is usually so."""
-        if self._streaks:
-            self._usual |= {name: streak.late for name, streak in self._streaks.items() if streak.verdict is _Verdict.SLOW}
-            self._streaks.clear()
-        if late < self._usual.get(source, 0):
-            self._usual[source] = max(0, late)
-
-    def _agreed(self, verdict: _Verdict, source: str, stamp: int, receive: int, late: int) -> int | None:
-        """The offset to align anew to, once enough consecutive stamps of a source agree on one."""
-        offset = receive - stamp
-        streak = self._streaks.get(source)
-        if streak is None or not streak.continued(verdict, receive, offset):
-            self._streaks[source] = _Streak(verdict, receive, stamp, stamp, offset, late)
-            return None
-        if stamp == streak.last_stamp:
-            return None
-        streak.count += 1
-        streak.last_stamp = stamp
-        streak.offset = min(streak.offset, offset)
-        streak.late = min(streak.late, late)
-        count, span = _CONFIRMATION[streak.verdict]
-        if self._unix is None and self.trusted:
-            count, span = max(count, 3), max(span, TRUST_LOST_AFTER)
-        agreed = streak.count >= count and min(receive - streak.first_receive, abs(stamp - streak.first_stamp)) >= span
-        return streak.offset if agreed else None
-
-    def learn_pair(self, unix_less_boot: int, receive: int) -> None:
-        """Take the difference of the Unix clock and this one, read at one instant."""
-        pairs, odd = self._pairs, self._odd_pair
-        self._odd_pair = None
-        if pairs is None:
-            self._pairs = pairs = OffsetFloor(receive, unix_less_boot)
-        elif abs(unix_less_boot - pairs.at(receive)) <= PAIR_TOLERANCE:
-            pairs.add(receive, unix_less_boot)
-        elif odd is not None and abs(unix_less_boot - odd) <= PAIR_TOLERANCE:
-            self._pairs = pairs = OffsetFloor(receive, unix_less_boot)
-        else:
-            self._odd_pair = unix_less_boot
-            return
-        future = pairs.at(receive) - self._floor.at(receive)
-        self.trusted = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.trusted else 2)
-        self.complaint = "" if self.trusted else "SYSTEM_TIME contradicts receipts"
-
-    def learn_trip(self, stamp: int, sent: int, receive: int) -> None:
-        """Take a reading of this clock made between `sent` and `receive`."""
-        if not self._pieces:
-            return
-        self._trips.add(stamp, sent, receive)
-        offset = self._trips.at(receive)
-        if offset is not None:
-            future = offset - self._floor.at(receive)
-            self.synchronised = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.synchronised else 2)
-            if not self.synchronised:
-                self.complaint = "TIMESYNC contradicts receipts"
-
-    def bridge_to(self, unix: _Aligner, receive: int) -> None:
-        """Tell the Unix clock its offset from the host's, where this clock's offset from both is known."""
-        offset = self._trips.at(receive) if self._pieces and self.synchronised and self._pairs else None
-        if offset is not None and self._pairs and unix.begun:
-            bridge = offset - self._pairs.at(receive)
-            plausible = -PLAUSIBLE_LATENCY <= bridge - unix.floor_at(receive) <= FUTURE_TOLERANCE
-            unix.bridge = bridge if plausible else None
-
-    def report(self) -> ClockReport:
-        offset = self._pieces[-1].at(self._newest) if self._pieces else 0
-        method: Method = "least_offset"
-        note = self.complaint
-        if self._pieces and (self.synchronised or self.bridge is not None):
-            method, note = "timesync", ""
-        elif self.anchored:
-            method = "unix" if self._unix is None else "system_time"
-        elif self._unix is None:
-            note = f"host clock and Unix stamps differ by {offset / SECOND:+.3f} s"
-        elif self._pairs and not self._unix.trusted:
-            note = "SYSTEM_TIME: Unix time is not trusted"
-        jitter = self._latency // max(1, self._placed)
-        drift = self._floor.slope / 1e3
-        return ClockReport(method, offset, drift, jitter, self.resets, self.strays, self.samples, note)
-
 
 class Clock:
-    """Turns what was received into measurements on one time line."""
+    """Turns received events into measurements on one time line."""
 
     def __init__(self, config: Config) -> None:
         self._delays = {name: source.delay_ns for name, source in config.streams().items()}
-        self._aligners = {UNIX_CLOCK: _Aligner(None)}
+        self._aligners = {UNIX_CLOCK: Aligner(None)}
         self._arrivals = 0
 
     def align(self, received: Received) -> Measurement | None:
-        """The measurement, Invalid with a reason where the stamp makes no sense; None for a ClockPair."""
+        """The measurement; its payload is Invalid if the stamp is unusable. None for a ClockPair."""
         payload = received.payload
         if isinstance(payload, ClockPair):
             self._learn(received, payload)
@@ -360,20 +43,20 @@ class Clock:
         return Measurement(t_ns - self._delays.get(source, 0), source, received.sequence, receive, payload)
 
     def report(self) -> dict[str, ClockReport]:
-        """How each clock is aligned, by name; "arrival" stands for what came without a stamp."""
+        """How each clock is aligned, by name; "arrival" is for events without a stamp."""
         reports = {name: aligner.report() for name, aligner in sorted(self._aligners.items()) if aligner.samples}
         if self._arrivals:
             reports["arrival"] = ClockReport("arrival", 0, 0.0, 0, 0, 0, self._arrivals)
         return reports
 
-    def _aligner(self, clock: str) -> _Aligner:
+    def _aligner(self, clock: str) -> Aligner:
         aligner = self._aligners.get(clock)
         if aligner is None:
-            aligner = self._aligners[clock] = _Aligner(self._aligners[UNIX_CLOCK])
+            aligner = self._aligners[clock] = Aligner(self._aligners[UNIX_CLOCK])
         return aligner
 
     def _learn(self, received: Received, pair: ClockPair) -> None:
-        """Both stamps of a pair teach their clocks; the pair is taken if both fit."""
+        """Learn from a pair: each stamp for its own clock, and their difference if both fit."""
         stamp = received.t_sensor_ns
         if pair.clock == HOST_CLOCK and received.clock and stamp is not None and stamp > 0:
             asked = self._aligner(received.clock)

@@ -1,25 +1,26 @@
-"""The least of an offset between two clocks that latency disturbs upwards only, with drift."""
+"""The least offset between two clocks, with drift, from offsets that latency only ever increases."""
 
 from __future__ import annotations
 
 from itertools import pairwise
 
-BILLION = 10**9
-SECOND = BILLION  # ns
+from fusiond.units import SECOND
+
+BILLION = 10**9  # a rate of one, in parts per billion
 FIRST_BUCKET = SECOND // 4
 LAST_BUCKET = 8 * SECOND
 BUCKETS = 80  # a full window is 80 buckets of 8 s
-MAX_DRIFT = 300_000  # parts per billion; a crystal drifts by 100 000 at most
-EXTRAPOLATION = 20  # a drift is trusted for this many times the span that it was learnt from
+MAX_DRIFT = 300_000  # parts per billion; a crystal drifts by at most 100 000
+EXTRAPOLATION = 20  # a drift is used for this many times the span that it was learnt from
 
 
 class OffsetFloor:
     """A line under the points (x, y) of a sliding window: y = constant + drift x + (noise >= 0), all in ns.
 
-    The window is a row of buckets, each keeping its lowest point; a young window has short buckets, which merge in
-    pairs as it fills. When a bucket is complete, the line is laid along that edge of the points' lower convex hull
-    which lies at three quarters of the window: a reach to the present so short that the noise of the minima is not
-    magnified. In between, a point below the line lowers it at once. Amortised O(1) time, at most BUCKETS points.
+    The window is a sequence of buckets, and each keeps its lowest point. A young window has short buckets, which merge in
+    pairs as it fills. When a bucket is complete, the line is laid along the edge of the points' lower convex hull at three
+    quarters of the window: close enough to the present that extrapolation does not magnify the noise of the minima. In
+    between, a point below the line lowers it at once. Amortised O(1) time, at most BUCKETS points.
     """
 
     __slots__ = ("_bucket", "_bucket_height", "_least", "_length", "_newest", "_origin", "_points", "_reach", "_start",
@@ -39,11 +40,11 @@ class OffsetFloor:
         return self.slope * (span if span < self._reach else self._reach) // BILLION
 
     def at(self, x: int) -> int:
-        """The line's value at x, or at its newest complete bucket where x lies before that."""
+        """The line's value at x; at its newest complete bucket if x is before that."""
         return self._least + self._rise(max(x, self._origin))
 
     def add(self, x: int, y: int) -> None:
-        """Take in a point; x is raised to the newest one where it falls behind it."""
+        """Add a point. An x before the newest one counts as the newest."""
         if x < self._newest:
             x = self._newest
         self._newest = x

@@ -1,41 +1,41 @@
-"""The offset between the host's clock and a remote one, of questions asked and answered (MAVLink TIMESYNC)."""
+"""The offset between the host's clock and a remote one, from round trips (MAVLink TIMESYNC)."""
 
 from __future__ import annotations
 
 from fusiond.timeline.least_offset import OffsetFloor
+from fusiond.units import MILLISECOND
 
-MILLISECOND = 1_000_000  # ns
-LONGEST = 10 * MILLISECOND  # a round trip that takes longer is too inaccurate (as in PX4)
-DEVIATION = 20 * MILLISECOND  # no two good round trips of steady clocks can differ by so much
-DEVIATIONS = 5  # so many in a row that do: a clock has moved, and everything is learnt anew (as PX4)
+MAX_TRIP = 10 * MILLISECOND  # a longer round trip is too inaccurate (as in PX4)
+MAX_DEVIATION = 20 * MILLISECOND  # two good round trips of steady clocks differ by less
+DEVIATIONS = 5  # after this many deviating trips in a row the clock has moved, and learning restarts (as in PX4)
 
 
 class RoundTrips:
-    """host less remote [ns], by round trips: asked when the host's clock read `sent`, answered with the remote clock's
-    reading, heard when the host's read `receive`.
+    """Offset host less remote [ns], from round trips: the request left when the host's clock read `sent`, the reply has
+    the reading of the remote clock, and arrived when the host's clock read `receive`.
 
-    So the offset is at most receive - remote, and at least sent - remote. Latency only ever loosens these bounds; the least
-    of each, as a line with drift, is an `OffsetFloor`. The offset is the middle between the two.
+    So the offset is at most receive - remote, and at least sent - remote. Latency only ever loosens these bounds. The
+    tightest of each, as a line with drift, is an `OffsetFloor`. The offset is the middle between the two.
     """
 
     def __init__(self) -> None:
         self.taken = self.slow = self.deviating = 0
         self._bounds: tuple[OffsetFloor, OffsetFloor] | None = None  # of the offset from above, of its negative
-        self._row = 0  # deviations in a row
+        self._consecutive = 0  # deviating trips in a row
 
     def add(self, remote: int, sent: int, receive: int) -> None:
-        """Take in a round trip, unless it was slow or deviates."""
-        if not 0 <= receive - sent <= LONGEST:
+        """Learn from a round trip, unless it is slow or deviates."""
+        if not 0 <= receive - sent <= MAX_TRIP:
             self.slow += 1
             return
         known = self.at(receive)
-        if known is not None and abs((sent + receive) // 2 - remote - known) > DEVIATION:
+        if known is not None and abs((sent + receive) // 2 - remote - known) > MAX_DEVIATION:
             self.deviating += 1
-            self._row += 1
-            if self._row < DEVIATIONS:
+            self._consecutive += 1
+            if self._consecutive < DEVIATIONS:
                 return
             self._bounds = None
-        self._row = 0
+        self._consecutive = 0
         self.taken += 1
         if self._bounds is None:
             self._bounds = OffsetFloor(receive, receive - remote), OffsetFloor(receive, remote - sent)

@@ -1,5 +1,5 @@
-"""A real drive: accuracy on the captured RAV4 trace, as it is, with arrival stamps, without GNSS, without rewinding; and
-the delay that is learnt from it."""
+"""Accuracy on the captured RAV4 trace: as it is, with arrival stamps, without GNSS, without rewinding; and the delay that is
+learnt from it."""
 
 from __future__ import annotations
 
@@ -72,16 +72,16 @@ def test_fixes_at_their_own_time() -> None:
     assert found.position.inside_95 >= 0.95
 
 
-@pytest.mark.parametrize(("seconds", "most_m"), [("12-22", 1.0), ("18-28", 0.5)])
-def test_ten_seconds_without_gnss(seconds: str, most_m: float) -> None:
+@pytest.mark.parametrize(("seconds", "limit_m"), [("12-22", 1.0), ("18-28", 0.5)])
+def test_ten_seconds_without_gnss(seconds: str, limit_m: float) -> None:
     end = float(seconds.partition("-")[2])
     found = errors(car(), window=Window(end - 1, end), withhold=f"gps0:{seconds}")
-    assert found.position.end_m <= most_m
+    assert found.position.end_m <= limit_m
     assert found.position.inside_95 >= 0.95
 
 
 def test_nothing_in_the_configuration_is_fitted_to_the_drive() -> None:
-    """The delays start from nothing, and the results do not hang on how widely."""
+    """The delays start at zero, and their initial sigmas hardly matter."""
     receiver = car().gnss["gps0"]
     assert receiver.delay_ms == receiver.velocity_delay_ms == 0.0
     for factor in (2 / 3, 1.5):
@@ -99,7 +99,7 @@ def test_fixes_stamped_at_their_arrival_with_the_delay_given() -> None:
 
 
 def test_the_delay_of_fixes_stamped_at_their_arrival_is_learnt() -> None:
-    """78 ms, started from nothing."""
+    """78 ms, from an initial value of 0."""
     found = learnt(car(delay_sigma_ms=100.0), "drive-gps-boot-time.tlog")
     delay, sigma = found["delay_ms"]
     assert abs(delay - 78) <= 15
@@ -107,7 +107,7 @@ def test_the_delay_of_fixes_stamped_at_their_arrival_is_learnt() -> None:
 
 
 def test_fusing_each_fix_at_its_arrival_is_clearly_worse() -> None:
-    """Without rewinding: every fix is taken for one of the instant it arrives."""
+    """Without rewinding: every fix is fused at the instant of its arrival."""
     found = errors(car(stamp="arrival", **FROZEN))
     assert found.position.rmse_m > 2 * errors(car()).position.rmse_m
 

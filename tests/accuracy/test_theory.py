@@ -1,4 +1,4 @@
-"""Honesty by Monte Carlo: the errors of many runs against the covariance that the filter claims for them."""
+"""Consistency by Monte Carlo: the errors of many runs against the covariance that the filter claims."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def study() -> dict[str, np.ndarray]:
         events = measurements(truth, seed=100 + run, gyro_bias=tuple(gyro), accel_bias=tuple(accel))
         fusion, row, tested = Fusion(SETTINGS, True), {name: [] for name in BLOCKS}, []
         for event in events:
-            fusion.take(event)
+            fusion.fuse(event)
             if event.source == "imu0" and event.sequence % 100 == 0 and event.sequence >= 1000:
                 error, covariance = errors(fusion, truth, event.sequence), fusion.history.head.covariance
                 for name, block in BLOCKS.items():

@@ -1,7 +1,6 @@
-"""The bundled drive gives the published states it gave before, bit for bit, by either kernel; a change of them is on purpose
-or a fault.
+"""Both kernels give the recorded states of the bundled drive, bit for bit: any change is either intended or a defect.
 
-After a change on purpose: `python -m tests.golden.test_golden` writes the new states, and the commit says by how much they
+After an intended change, `python -m tests.golden.test_golden` writes the new states, and the commit says by how much they
 differ and why that is better.
 """
 

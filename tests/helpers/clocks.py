@@ -1,4 +1,4 @@
-"""Stamped events, and series of them, for the tests of the clock."""
+"""Stamped events for the tests of the clock."""
 
 from __future__ import annotations
 

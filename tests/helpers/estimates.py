@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import OutcomeCounts, State, StateMessage
 
@@ -41,7 +41,7 @@ def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, flo
     return w, x, y, z
 
 
-def state(**changes: Any) -> StateEstimate:
+def state(**changes: Any) -> SolutionState:
     """A plausible state, with changes."""
     root = np.random.default_rng(3).normal(size=(9, 9)) * 0.1
     values: dict[str, Any] = {
@@ -62,12 +62,12 @@ def state(**changes: Any) -> StateEstimate:
         "sigma_wheel_scale": 1e-3,
         "sigma_mount": (1e-3, 2e-3),
     }
-    return StateEstimate(**{**values, **changes})
+    return SolutionState(**{**values, **changes})
 
 
-def message(inner: StateEstimate | None, mode: Mode = Mode.NOMINAL) -> StateMessage:
+def message(inner: SolutionState | None, mode: Mode = Mode.NOMINAL) -> StateMessage:
     """The message of an estimate with a state, or without one."""
-    return state_message(Estimate(T_NS, mode, age_ns=2_500_000, resets=1, state=inner), "rover", COUNTS)
+    return state_message(Solution(T_NS, mode, age_ns=2_500_000, resets=1, state=inner), "rover", COUNTS)
 
 
 def numbers(published: State) -> list[float]:
@@ -110,15 +110,15 @@ def random_messages(count: int) -> list[StateMessage]:
     """The first is aligning, the rest have random states."""
     random = np.random.default_rng(11)
 
-    def state() -> StateEstimate:
+    def state() -> SolutionState:
         root = random.normal(size=(9, 9))
         values: dict[str, Any] = {name: random.normal() for name in SCALARS}
         values |= {name: tuple(random.normal(size=size).tolist()) for name, size in VECTORS.items()}
-        return StateEstimate(covariance=root @ root.T, **values)
+        return SolutionState(covariance=root @ root.T, **values)
 
-    def told(number: int) -> Estimate:
+    def told(number: int) -> Solution:
         t_ns = 1_700_000_000_000_000_001 + number * 20_000_000
         mode = Mode.NOMINAL if number else Mode.ALIGNING
-        return Estimate(t_ns, mode, 3_000_001, 0, state() if number else None)
+        return Solution(t_ns, mode, 3_000_001, 0, state() if number else None)
 
     return [state_message(told(number), "rover", OutcomeCounts(fused=number)) for number in range(count)]

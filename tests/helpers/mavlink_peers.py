@@ -21,7 +21,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fusiond.config.schema import Config
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import OutcomeCounts, State, StateMessage
@@ -43,7 +43,7 @@ def state_at(t_ns: int, number: int = 0, mode: Mode = Mode.NOMINAL, resets: int 
     """A state on a curve, with a full covariance; `scale` is of its sigmas."""
     root = np.random.default_rng(number).normal(size=(9, 9)) * np.repeat((0.3, 0.05, 0.02), 3)[:, None] * scale
     w, x, y, z = quaternion(matrix_from_euler(0.05 * number, -0.1, 1.7 + 0.2 * number)).tolist()
-    estimate = StateEstimate(
+    estimate = SolutionState(
         latitude=0.8401 + number * 1.1e-5, longitude=0.2 - number * 2.3e-5, height=612.5 + 3.25 * number,
         velocity_n=(3.0 + number, -8.0, 0.25), quaternion_nb=(w, x, y, z),
         angular_rate_b=(0.01, -0.02, 0.1 * number), acceleration_b=(0.3, -0.2, -9.7),
@@ -51,7 +51,7 @@ def state_at(t_ns: int, number: int = 0, mode: Mode = Mode.NOMINAL, resets: int 
         covariance=root @ root.T, sigma_gyro_bias=(1e-3, 2e-3, 3e-3), sigma_accel_bias=(0.01, 0.02, 0.03),
         sigma_wheel_scale=1e-3, sigma_mount=(1e-3, 1e-3))  # fmt: skip
     without = mode in (Mode.ALIGNING,)
-    return state_message(Estimate(t_ns, mode, age_ns, resets, None if without else estimate), "test", OutcomeCounts())
+    return state_message(Solution(t_ns, mode, age_ns, resets, None if without else estimate), "test", OutcomeCounts())
 
 
 def recent(count: int, spacing_ms: int = 40, **changes: Any) -> list[StateMessage]:

@@ -1,4 +1,4 @@
-"""Configurations, drives and measurement streams that the tests of the filter core share. Everything is seeded."""
+"""Configurations, drives and measurements for the tests of the filter. Everything is seeded."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ T0 = 1_700_000_000 * SECOND
 MUNICH = (math.radians(48.1), math.radians(11.6), 520.0)  # rad, rad, m
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
-PULLS_AWAY_S = 3.0  # when the drives that depart do so
+PULLS_AWAY_S = 3.0  # when drives that begin at rest pull away
 Curve = Callable[[Array], Array]
 
 
@@ -117,8 +117,8 @@ def measurements(
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0),
     accel_bias: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> list[Measurement]:
-    """What the sensors of `config` say of a drive, in the order of their stamps; without noise where seed is None. An IMU
-    at rest is ten times as quiet as one on the road."""
+    """The measurements of a drive by the sensors of `config`, in the order of their stamps; without noise if seed is None.
+    At rest the IMU has a tenth of its noise on the road."""
     rng = np.random.default_rng(seed or 0)
     strength = 0.0 if seed is None else 1.0
     step = truth.seconds[1] - truth.seconds[0]
@@ -154,10 +154,10 @@ def triple(vector: Array) -> tuple[float, float, float]:
 
 
 def fuse(configuration: Config, events: Iterable[Measurement], compiled: bool | None = None) -> Fusion:
-    """A filter that took the events in the order given."""
+    """A fusion that has fused the events in the order given."""
     fusion = Fusion(configuration, compiled)
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
     return fusion
 
 
@@ -167,7 +167,7 @@ def running_state(
     start: tuple[float, float, float] = MUNICH,
     size: int = ERROR_SIZE,
 ) -> FilterState:
-    """A running filter state with everything at random sizes that occur, and a full covariance."""
+    """A running filter state with random values of realistic size, and a full covariance."""
     state = FilterState(sources, size)
     x = state.nominal[: size + 1]
     x[:] = rng.normal(0.0, 0.01, len(x))
@@ -185,8 +185,8 @@ def running_state(
 
 
 def apply(configuration: Config, state: FilterState, events: Iterable[Measurement], compiled: bool) -> Fusion:
-    """Run events through the kernel, from a running state on and without a history. The result's history holds the rows
-    and the head."""
+    """Run events through the kernel from a running state, without a history. The result's history has the rows and the
+    head."""
     fusion = Fusion(configuration, compiled)
     history, layout = fusion.history, fusion.plan
     values = [(event, fusion._values(event)) for event in sorted(events, key=lambda event: event.key)]
@@ -217,5 +217,5 @@ def same_bits(a: Fusion, b: Fusion) -> None:
 
 
 def bits(numbers: Array) -> np.ndarray:
-    """The numbers as integers: tells -0 from 0 and compares NaN."""
+    """The numbers as integers: -0 and 0 differ, and equal NaN compare equal."""
     return np.ascontiguousarray(numbers).view(np.int64)

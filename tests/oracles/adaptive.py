@@ -1,4 +1,4 @@
-"""Noise that is learnt: weights of redundant sensors, their variances from cross-moments, a lone sensor's from innovations.
+"""Learnt noise: weights of redundant sensors, variances from cross-moments, the variance of one sensor from innovations.
 
 Sources: Xu and others, Multi-sensor adaptively weighted data fusion (cross-moments); Mehra, On the identification of
 variances and adaptive Kalman filtering (1970), for innovations.
@@ -30,15 +30,15 @@ class CrossMoments:
     second moment less the mean of its cross-moments, s_i^2 = R_ii - R_i. The moments are means over all samples, or, with
     `memory` (a number of samples), ones that forget exponentially."""
 
-    def __init__(self, sensors: int, least: float = 0.0, most: float = math.inf, memory: float = math.inf) -> None:
-        """The answer is held within `least` and `most`. ValueError for fewer than two sensors."""
+    def __init__(self, sensors: int, minimum: float = 0.0, maximum: float = math.inf, memory: float = math.inf) -> None:
+        """The variances are limited to `minimum` and `maximum`. ValueError for fewer than two sensors."""
         if sensors < 2:
             raise ValueError("cross-moments need two sensors or more")
         self.moments: Array = np.zeros((sensors, sensors))
         self.samples = 0
-        self.least, self.most, self.memory = least, most, memory
+        self.minimum, self.maximum, self.memory = minimum, maximum, memory
 
-    def take(self, readings: Array) -> None:
+    def add(self, readings: Array) -> None:
         """One reading of each sensor, (k,), of the same instant: R(k) = (k-1)/k R(k-1) + z_i z_j / k."""
         self.samples += 1
         share = max(1 / self.samples, 1 / self.memory)
@@ -48,26 +48,26 @@ class CrossMoments:
         """s_i^2 (k,), bounded."""
         own = np.diag(self.moments)
         across = (self.moments.sum(axis=1) - own) / (len(own) - 1)
-        return np.asarray(np.clip(own - across, self.least, self.most))
+        return np.asarray(np.clip(own - across, self.minimum, self.maximum))
 
 
 class InnovationNoise:
-    """A lone sensor's variance per axis from its innovations: R = mean(d d') - H P H', bounded, over a memory of so many
+    """A lone sensor's variance per axis from its innovations: R = mean(d d') - H P H', bounded, over a memory of `memory`
     samples; the first guess counts as `trust` of them."""
 
-    def __init__(self, first: Array, least: Array, most: Array, memory: float = 100.0, trust: float = 1.0) -> None:
+    def __init__(self, first: Array, minimum: Array, maximum: Array, memory: float = 100.0, trust: float = 1.0) -> None:
         """All (m,) variances."""
         self.raw: Array = first.copy()
         self.samples = trust
-        self.least, self.most, self.memory = least, most, memory
+        self.minimum, self.maximum, self.memory = minimum, maximum, memory
 
-    def take(self, innovation: Array, predicted: Array) -> None:
+    def add(self, innovation: Array, predicted: Array) -> None:
         """One innovation (m,) and the diagonal (m,) of H P H', the variance that the state gives it by itself. The bounds
-        hold the answer, not the mean: clipping before averaging would bias it."""
+        limit the result, not the mean: clipping before averaging would bias it."""
         self.samples += 1
         share = max(1 / self.samples, 1 / self.memory)
         self.raw = self.raw + share * (innovation * innovation - predicted - self.raw)
 
     def variance(self) -> Array:
         """R (m,), bounded."""
-        return np.asarray(np.clip(self.raw, self.least, self.most))
+        return np.asarray(np.clip(self.raw, self.minimum, self.maximum))

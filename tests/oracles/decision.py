@@ -12,7 +12,7 @@ from fusiond.maths.typed import Array
 
 def posterior(prior: Array, likelihoods: Array) -> Array:
     """P(A_i given B_1..B_n) (m,) of the prior (m,) and the likelihoods of one observation, (m,), or of n independent ones,
-    (n, m). ValueError where no hypothesis allows what was observed."""
+    (n, m). ValueError if no hypothesis allows what was observed."""
     found = prior.copy()
     for likelihood in np.atleast_2d(likelihoods):
         found = found * likelihood
@@ -25,7 +25,7 @@ def posterior(prior: Array, likelihoods: Array) -> Array:
 
 def missed(prior: Array, detection: Array) -> Array:
     """Posterior (m,) after an expected observation did not come: hypothesis i gives it with probability `detection` i, so
-    the miss has likelihood 1 - P_D. ValueError where every hypothesis was sure to give it."""
+    the miss has likelihood 1 - P_D. ValueError if every hypothesis was sure to give it."""
     return posterior(prior, 1 - detection)
 
 
@@ -36,7 +36,7 @@ def carried(prior: Array, change: Array) -> Array:
 
 
 def staying(count: int, leave: float) -> Array:
-    """A `change` matrix (count, count) in which every hypothesis is left with probability `leave`, to the others alike.
+    """A `change` matrix (count, count): every hypothesis is left with probability `leave`, for the others with equal shares.
     ValueError unless 0 <= leave <= 1 and count >= 2."""
     if not (0 <= leave <= 1 and count >= 2):
         raise ValueError(f"leave {leave} must lie in [0, 1], count {count} must be 2 or more")

@@ -2,8 +2,8 @@
 
 A case is a few seconds of a drive with everything that makes arrival matter: duplicates, outliers at the gate's edge,
 invalid samples, IMU samples that are missing for longer than it may be silent, events stamped after the newest IMU
-sample. It is fused in the order of the stamps, and again in a random order of arrival in which nobody is later than the
-horizon. What is drawn is a seed and the shape of the case; the seed is printed where a case fails.
+sample. It is fused in the order of the stamps, and again in a random order of arrival in which no event is later than the
+horizon. Hypothesis draws a seed and the shape of the case, and prints them when a case fails.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fusiond.filter.state import PHASE, RUNNING, T
 from tests.conftest import needs_compiled
 from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
 
-PREFIX_S, LENGTH_S = 2.0, 2.5  # of a case: in order, so that the filter runs; and shuffled
+PREFIX_S, LENGTH_S = 2.0, 2.5  # of a case: first in order, so that the filter aligns; then shuffled
 QUIET = settings(deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 
 CASES = st.fixed_dictionaries(
@@ -33,9 +33,9 @@ CASES = st.fixed_dictionaries(
         "snapshot_interval_s": st.sampled_from([0.0, 0.01, 0.05, 0.3]),
         "imu_hole": st.booleans(),
         "correlation_s": st.sampled_from([0.0, 0.5]),
-        "heading": st.booleans(),  # given, or chosen by the bank of hypotheses
-        "learns": st.booleans(),  # delays, lever arm, scale of each wheel; fixes weighed as a mixture
-        "look_every": st.sampled_from([1, 1, 1, 10, 10**6]),  # events: they are run when somebody looks
+        "heading": st.booleans(),  # given, or found by the bank of hypotheses
+        "learns": st.booleans(),  # delays, lever arm, scale of each wheel; fixes weighted as a mixture
+        "read_every": st.sampled_from([1, 1, 1, 10, 10**6]),  # events: reading the state runs them
     }
 )
 Case = dict[str, float]
@@ -75,7 +75,7 @@ def stretch(case: Case) -> tuple[list[Measurement], list[Measurement]]:
 
 
 def spoiled(events: list[Measurement], case: Case) -> list[Measurement]:
-    """With lost IMU samples, outliers, invalid samples and duplicates, all by the case's seed."""
+    """The events with lost IMU samples, outliers, invalid samples and duplicates, all from the case's seed."""
     random = np.random.default_rng(int(case["seed"]))
     hole = events[0].t_ns + round(random.uniform(0.2, 1.5) * SECOND)
     held: list[Measurement] = []
@@ -90,7 +90,7 @@ def spoiled(events: list[Measurement], case: Case) -> list[Measurement]:
         elif chance < 0.12:
             payload = Invalid("fault")
         held.append(Measurement(event.t_ns, event.source, event.sequence, event.t_receive_ns, payload))
-        if chance > 0.97:  # the very same event once more
+        if chance > 0.97:  # the same event again
             held.append(held[-1])
         elif chance > 0.95:  # another event of the source with the same stamp
             other = off(event.payload, random)
@@ -123,13 +123,13 @@ def check(case: Case, compiled: bool) -> None:
     in_order = fuse(settings_, prefix + events, compiled)
     shuffled = Fusion(settings_, compiled)
     for number, event in enumerate(prefix + arrival(events, case)):
-        shuffled.take(event)
-        if number % case["look_every"] == 0:
+        shuffled.fuse(event)
+        if number % case["read_every"] == 0:
             assert shuffled.history.head.stamps[T] <= shuffled.history.applied_ns
     assert in_order.history.head.stamps[PHASE] == RUNNING or not case["heading"]
     assert sum(in_order.totals().values()) == len(prefix) + len(events)
     assert in_order.totals()["TOO_OLD"] == 0
-    assert shuffled.history.rerun > 0 or case["look_every"] > 10
+    assert shuffled.history.rerun > 0 or case["read_every"] > 10
     same_bits(in_order, shuffled)
 
 

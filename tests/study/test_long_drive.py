@@ -1,7 +1,7 @@
-"""A day's drive at 400 Hz through the compiled loop: the covariance stays symmetric and positive definite, the error honest.
+"""A day's drive at 400 Hz in the compiled kernel: the covariance stays symmetric, positive definite and consistent.
 
-A closed ten-minute course with standstills and GNSS outages is driven round and round, with fresh noise each time. The
-events are laid out in arrays, as the kernel wants them, so that a day takes minutes.
+A closed ten-minute course with standstills and GNSS outages is driven repeatedly, each time with new noise. The events are
+prepared in arrays for the kernel, so that a day takes minutes.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from fusiond.maths.wgs84 import ecef, mat_ne
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import parse
 from fusiond.simulation.truth import Truth
+from fusiond.units import SECOND
 
 IMU_HZ, WHEEL_HZ, GNSS_HZ, SEED = 400, 100, 5, 20
 ACCEL_NOISE, GYRO_NOISE, WHEEL_SIGMA, POSITION_SIGMA, VELOCITY_SIGMA = 0.02, 5e-4, 0.05, 1.0, 0.1
 OUTAGE_S = (200.0, 320.0)  # of each round
-CHECK_EVERY = 20_000  # rows between two looks at the covariance
+CHECK_EVERY = 20_000  # rows between two checks of the covariance
 COURSE = """
 [start]
 latitude_deg = 48.0
@@ -73,7 +74,7 @@ class Course:
         self.truth: Truth = simulate(parse(COURSE), SEED).truth
         self.plan = plan(msgspec.convert(CONFIG, Config))
         truth, n = self.truth, len(self.truth.t_ns)
-        self.round_ns = n * 10**9 // IMU_HZ
+        self.round_ns = n * SECOND // IMU_HZ
         seconds = np.arange(n) / IMU_HZ
         fixes = np.arange(0, n, IMU_HZ // GNSS_HZ)
         fixes = fixes[(seconds[fixes] < OUTAGE_S[0]) | (seconds[fixes] >= OUTAGE_S[1])]
@@ -96,7 +97,7 @@ class Course:
 
     def _blank(self, at: np.ndarray, source: str) -> np.ndarray:
         rows = np.zeros(len(at), dtype=ROW)
-        rows["t_ns"] = at * 10**9 // IMU_HZ
+        rows["t_ns"] = at * SECOND // IMU_HZ
         rows["source"] = self.plan.sources.index(source)
         return rows
 
@@ -141,7 +142,7 @@ def drive(rounds: int) -> tuple[FilterState, list[float]]:
 
 
 def _nees(head: FilterState, truth: Truth, t_ns: int) -> float:
-    i = round(t_ns * IMU_HZ / 10**9)
+    i = round(t_ns * IMU_HZ / SECOND)
     place = ecef(truth.latitude[i], truth.longitude[i], truth.height[i])
     to_n = mat_ne(place)
     error = np.concatenate([place - head.nominal[POSITION_E], to_n.T @ truth.velocity_n[i] - head.nominal[VELOCITY_E]])
@@ -157,7 +158,7 @@ def check(rounds: int) -> None:
     assert head.stamps[BLOWN] == 0
     mean = float(np.mean(nees[len(nees) // rounds // 4 :]))
     print(f"{rounds} rounds, seed {SEED}: mean NEES of 4 degrees of freedom {mean:.2f}, largest {max(nees):.1f}")
-    assert mean < 12  # honest within a factor of three in variance: successive looks are not independent
+    assert mean < 12  # within a factor of three in variance: successive checks are not independent
 
 
 @pytest.mark.skipif(not compiled_available(), reason="the compiled kernel was not built")

@@ -43,13 +43,13 @@ def test_the_state_goes_first_and_the_rest_with_flush(setup: Config, events: lis
 def test_what_was_not_flushed_goes_before_anything_else_is_done(setup: Config, events: list[Received]) -> None:
     order: list[str] = []
     engine = Engine(setup, lambda message: order.append(type(message).__name__), rate_hz=RATE)
-    receive = engine.fusion.receive
+    receive = engine.fusion.feed
 
     def noted(event: Received) -> object:
         order.append("event")
         return receive(event)
 
-    engine.fusion.receive = noted  # type: ignore[method-assign, assignment]
+    engine.fusion.feed = noted  # type: ignore[method-assign, assignment]
     for event in events[:400]:
         engine.feed(event)
     assert {after for before, after in pairwise(order) if before == "event"} == {"event", "StateMessage"}

@@ -123,7 +123,7 @@ class LiveEngine:
                 self.offered += 1
                 usable += receipt.refusal is not Outcome.INVALID
         if usable:
-            self.engine.fusion.history.catch_up()  # now, so that a tick finds it done
+            self.engine.fusion.history.apply_rows()  # now, so that a tick finds it done
             late_ns = max(0, self._now() - t_ns)
             for _ in range(usable):
                 self.to_fusion.add(late_ns)

@@ -13,7 +13,7 @@ from msgspec import Struct
 from fusiond.app.replay.comparison import Errors, Histogram, TruthReport
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
-from fusiond.timeline.clock import ClockReport
+from fusiond.timeline.aligner import ClockReport
 
 LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # bins of the latency histograms and where they end
 LATENCIES_AT_ONCE = 1024

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from fusiond.__main__ import SUCCESS, UNUSABLE, USAGE, main
-from fusiond.config.schema import Config, Mcap
+from fusiond.config.outputs import Mcap
+from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.messages.codec import decode
 from fusiond.messages.csv import csv_row

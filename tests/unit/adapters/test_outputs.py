@@ -17,7 +17,8 @@ import pytest
 from fusiond.app.client import Client
 from fusiond.app.replay.replay import Replay, Wants
 from fusiond.config import load as config
-from fusiond.config.schema import Config, Zenoh
+from fusiond.config.outputs import Zenoh
+from fusiond.config.schema import Config
 from fusiond.messages.codec import encode
 from fusiond.messages.types import (
     ConfigMessage,

@@ -10,7 +10,7 @@ from urllib.request import urlopen
 import msgspec
 import pytest
 
-from fusiond.config.schema import Prometheus
+from fusiond.config.outputs import Prometheus
 from fusiond.messages.types import (
     HealthMessage,
     InnovationMessage,

@@ -13,7 +13,8 @@ import pytest
 import zenoh
 
 from fusiond.app.client import Client, ClientError
-from fusiond.config.schema import Config, Encoding, Publish, Vehicle, Zenoh
+from fusiond.config.outputs import Encoding, Publish, Zenoh
+from fusiond.config.schema import Config, Vehicle
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import (
     ConfigMessage,

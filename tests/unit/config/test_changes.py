@@ -1,4 +1,4 @@
-"""Of two configurations: what a running daemon takes over, and what it refuses."""
+"""Which changes of a configuration a running daemon accepts, and which need a restart."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ rate_hz = 10.0
         ('baro]\nlink = "fc"\nrate_hz = 10.0', 'baro]\nlink = "fc"\nrate_hz = 5.0', "barometer.baro.rate_hz"),
     ],
 )
-def test_the_rates_to_ask_for_change_live(old: str, new: str, key: str) -> None:
+def test_requested_rates_change_live(old: str, new: str, key: str) -> None:
     assert changes(parse(TEXT), parse(TEXT.replace(old, new))) == ((key,), ())
 
 
-def test_what_else_a_sensor_says_needs_a_restart() -> None:
+def test_other_keys_of_a_sensor_need_a_restart() -> None:
     new = TEXT.replace("rate_hz = 100.0", "rate_hz = 50.0\ndelay_ms = 3.0")
     assert changes(parse(TEXT), parse(new)) == ((), ("imu.imu0.delay_ms",))

@@ -1,4 +1,4 @@
-"""What `fusiond check` prints of a configuration: a paragraph for each sensor, and what is probably not meant."""
+"""What `fusiond check` prints of a configuration: a description of each sensor, and probable mistakes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 
 from fusiond.config.explain import description, oddities
 from fusiond.config.load import parse
-from fusiond.config.schema import Config, Foxglove, Mcap, Prometheus, sensor_tables
+from fusiond.config.outputs import Foxglove, Mcap, Prometheus
+from fusiond.config.schema import Config, sensor_tables
 from tests.helpers.drive import settings
 
 TEXT = """
@@ -55,7 +56,7 @@ def read(folder: Path, text: str = TEXT) -> Config:
     return parse(text, folder / "car.toml")
 
 
-def test_each_sensor_has_its_paragraph(folder: Path) -> None:
+def test_each_sensor_is_described(folder: Path) -> None:
     lines = list(description(read(folder)))
     first = next(i for i, line in enumerate(lines) if line.startswith("IMU"))
     last = next(i for i, line in enumerate(lines) if line.startswith("constraints"))
@@ -98,7 +99,7 @@ def test_nothing_is_odd_about_a_good_configuration(folder: Path) -> None:
         ("[mavlink.fc]", "[mavlink.fc]\n[can.chassis]", "can.chassis: no sensor comes by this bus"),
     ],
 )
-def test_what_is_probably_not_meant(folder: Path, old: str, new: str, oddity: str) -> None:
+def test_probable_mistakes(folder: Path, old: str, new: str, oddity: str) -> None:
     (found,) = oddities(read(folder, TEXT.replace(old, new)))
     assert found.startswith(oddity)
 
@@ -108,9 +109,9 @@ def test_a_stream_that_is_turned_off_is_not_odd(folder: Path) -> None:
     assert list(oddities(read(folder, off))) == []
 
 
-def test_check_tells_what_is_on() -> None:
+def test_outputs_that_are_on_are_listed() -> None:
     tables = {"mcap": Mcap(folder="out"), "foxglove": Foxglove(enabled=True), "prometheus": Prometheus(enabled=True)}
     on = "\n".join(description(msgspec.structs.replace(settings(), **tables)))
     off = "\n".join(description(settings()))
-    for told in ("ws://127.0.0.1:8765", "http://127.0.0.1:9464/metrics", "1024 MB at most"):
-        assert told in on and told not in off
+    for line in ("ws://127.0.0.1:8765", "http://127.0.0.1:9464/metrics", "1024 MB at most"):
+        assert line in on and line not in off

@@ -1,121 +1,36 @@
-"""Sensors and their streams are found in the configuration by type, and say of themselves what the rest needs to know."""
+"""What every kind of sensor declares, and the words for vectors and delays."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from fusiond.config.load import parse
-from fusiond.config.schema import Barometer, Config, Gnss, Imu, Wheel, sensor_tables
-from fusiond.config.sensor import INERTIAL
-from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Pressure, WheelSpeed
+from fusiond.config.schema import Barometer, Wheel, sensor_tables
+from fusiond.config.sensor import Sensor, delay_in_words, point_in_words, vector_in_words
 
-TEXT = """
-[mavlink.fc]
-[mavlink.second]
-[can.body]
-dbc = ["car.dbc"]
-delay_ms = 1.5
-[imu.imu0]
-link = "fc"
-delay_ms = 4.0
-[gnss.gps0]
-link = "second"
-delay_ms = 100.0
-velocity_delay_ms = 50.0
-position_correlation_s = 2.0
-velocity_correlation_s = 3.0
-position_sigma_m = 1.25
-group = "roof"
-shared_sigma_m = 0.5
-use_velocity = false
-noise_most = 4.0
-[wheel.left]
-bus = "body"
-message = "WHEELS"
-signal = "L"
-delay_ms = 0.25
-[wheel.encoder]
-link = "fc"
-index = 1
-delay_ms = 7.0
-[barometer.baro]
-link = "fc"
-correlation_s = 6.0
-"""
+KINDS = sensor_tables()
+ABSTRACT = [name for name, member in vars(Sensor).items() if getattr(member, "__isabstractmethod__", False)]
 
 
-@pytest.fixture
-def config(tmp_path: Path) -> Config:
-    (tmp_path / "car.dbc").touch()
-    return parse(TEXT, tmp_path / "car.toml")
+@pytest.mark.parametrize("table", KINDS)
+def test_every_kind_defines_the_abstract_methods(table: str) -> None:
+    assert set(ABSTRACT) == {"streams", "messages", "description"}
+    assert not any(getattr(getattr(KINDS[table], name), "__isabstractmethod__", False) for name in ABSTRACT)
 
 
-def test_the_tables_of_sensors_are_found_by_type() -> None:
-    known = {"imu": Imu, "gnss": Gnss, "wheel": Wheel, "barometer": Barometer}
-    assert known.items() <= sensor_tables().items()
-    assert not {"mavlink", "can", "motion"} & sensor_tables().keys()
+def test_inputs_are_the_keys_that_are_set() -> None:
+    assert Barometer(link="fc").inputs() == {"link": "fc"}
+    assert Wheel(bus="body", message="WHEELS", signal="L").inputs() == {"bus": "body"}
 
 
-def test_sensors_come_by_kind_and_then_as_in_the_file(config: Config) -> None:
-    named = [(table, name) for table, name, _ in config.sensors()]
-    assert named == [("imu", "imu0"), ("gnss", "gps0"), ("wheel", "left"), ("wheel", "encoder"), ("barometer", "baro")]
-    assert all(getattr(config, table)[name] is section for table, name, section in config.sensors())
+def test_the_origin_is_made_of_messages_and_inputs() -> None:
+    assert Barometer(link="fc", message="SCALED_PRESSURE2").origin() == "SCALED_PRESSURE2 of fc"
 
 
-def test_the_sensors_of_one_input(config: Config) -> None:
-    assert [sensor.name for sensor in config.sensors(link="fc")] == ["imu0", "encoder", "baro"]
-    assert [sensor.name for sensor in config.sensors(link="second")] == ["gps0"]
-    assert [sensor.name for sensor in config.sensors(bus="body")] == ["left"]
-    assert list(config.sensors(bus="fc")) == []
+def test_nothing_contradicts_itself_by_default() -> None:
+    assert list(Barometer(link="fc").contradictions()) == []
 
 
-def test_streams_tell_model_payload_and_table(config: Config) -> None:
-    found = {
-        name: (source.table, source.name, source.stream.model, source.stream.payload)
-        for name, source in config.streams().items()
-    }
-    assert found == {
-        "imu0": ("imu", "imu0", INERTIAL, ImuSample),
-        "gps0.position": ("gnss", "gps0", "gnss_position", GnssPosition),
-        "gps0.velocity": ("gnss", "gps0", "gnss_velocity", GnssVelocity),
-        "left": ("wheel", "left", "wheel_speed", WheelSpeed),
-        "encoder": ("wheel", "encoder", "wheel_speed", WheelSpeed),
-        "baro": ("barometer", "baro", "barometric_height", Pressure),
-    }
-    assert config.sources() == tuple(sorted(found))
-    assert config.streams()["left"].section is config.wheel["left"]
-
-
-def test_delays_are_in_nanoseconds_and_hold_the_delay_of_the_bus(config: Config) -> None:
-    assert {name: source.delay_ns for name, source in config.streams().items()} == {
-        "imu0": 4_000_000,
-        "gps0.position": 100_000_000,
-        "gps0.velocity": 150_000_000,
-        "left": 1_750_000,
-        "encoder": 7_000_000,
-        "baro": 0,
-    }
-
-
-def test_what_streams_say_of_their_errors(config: Config) -> None:
-    streams = {name: source.stream for name, source in config.streams().items()}
-    position, velocity = streams["gps0.position"], streams["gps0.velocity"]
-    assert (position.correlation_s, position.sigma, position.group, position.shared_sigma) == (2.0, 1.25, "roof", 0.5)
-    assert (velocity.correlation_s, velocity.sigma, velocity.group, velocity.shared_sigma) == (3.0, 0.2, None, 0.0)
-    assert (position.enabled, velocity.enabled) == (True, False)
-    assert (position.companion, velocity.companion) == (".velocity", None)
-    assert (position.noise_min, position.noise_max, streams["left"].noise_max) == (1.0, 4.0, 3.0)
-    assert streams["baro"].correlation_s == 6.0
-
-
-@pytest.mark.parametrize(("outliers", "share"), [("gate", 0.0), ("mixture", 0.125)])
-def test_outliers_are_weighed_only_where_they_are_a_mixture(outliers: str, share: float) -> None:
-    text = '[mavlink.fc]\n[imu.imu0]\nlink = "fc"\n[gnss.gps0]\nlink = "fc"\noutlier_share = 0.125\n'
-    streams = parse(f'{text}outliers = "{outliers}"\n').streams()
-    assert {name: source.stream.outlier_share for name, source in streams.items()} == {
-        "imu0": 0.0,
-        "gps0.position": share,
-        "gps0.velocity": share,
-    }
+def test_words_for_vectors_and_delays() -> None:
+    assert vector_in_words((1.0, -0.5, 0.25)) == "1 -0.5 0.25"
+    assert point_in_words((1.0, -0.5, 0.25)) == "1 -0.5 0.25 m (forward, right, down)"
+    assert (delay_in_words(0.0), delay_in_words(2.5)) == ("no delay", "delay 2.5 ms")

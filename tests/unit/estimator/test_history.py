@@ -1,4 +1,4 @@
-"""Events out of order: outcomes at their limits, waiting, coasting, bounded memory; the same bits whatever came when."""
+"""Events out of order: outcomes at their limits, waiting, coasting, bounded memory, and the same bits in any order."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ def until(seconds: float) -> list[Measurement]:
 
 
 def delayed(late: Iterable[Measurement], by_ns: int, events: list[Measurement] = EVENTS) -> list[Measurement]:
-    """The events in an order of arrival in which some come late."""
+    """The events in an order of arrival in which some are late."""
     held = {id(event) for event in late}
     return sorted(events, key=lambda event: (event.t_ns + (by_ns if id(event) in held else 0), event.key))
 
 
-def looked_at(configuration: Config, events: list[Measurement], compiled: bool) -> Fusion:
-    """A filter that took the events in the order given, and applied each before the next came."""
+def run_one_by_one(configuration: Config, events: list[Measurement], compiled: bool) -> Fusion:
+    """A fusion that has fused the events in the order given, and applied each before the next one."""
     fusion = Fusion(configuration, compiled)
     for offered in events:
-        fusion.take(offered)
+        fusion.fuse(offered)
         assert fusion.history.head.stamps[T] <= fusion.history.applied_ns
     return fusion
 
@@ -73,12 +73,12 @@ def test_late_events_in_the_interpreted_kernel() -> None:
 
 
 @LONG
-def test_one_late_event_reruns_what_lies_after_it(compiled: bool) -> None:
+def test_one_late_event_reruns_the_rows_after_it(compiled: bool) -> None:
     fix = next(event for event in EVENTS if event.source == "gps0.position" and event.t_ns > T0 + 8 * SECOND)
     before = [event for event in EVENTS if event.t_ns <= fix.t_ns + 400 * MS]
-    fusion = looked_at(settings(), [event for event in before if event is not fix], compiled)
+    fusion = run_one_by_one(settings(), [event for event in before if event is not fix], compiled)
     assert fusion.history.rerun == 0
-    assert fusion.take(fix).outcome is Outcome.FUSED
+    assert fusion.fuse(fix).outcome is Outcome.FUSED
     rows = len([event for event in before if event.t_ns > fix.t_ns - 50 * MS])
     assert 0.8 * rows < fusion.history.rerun <= rows
     same_bits(fusion, fuse(settings(), before, compiled))
@@ -88,8 +88,8 @@ def test_one_late_event_reruns_what_lies_after_it(compiled: bool) -> None:
 def test_events_that_come_late_together_are_run_once(compiled: bool) -> None:
     late = [event for event in EVENTS if "gps0" in event.source and T0 + 8 * SECOND < event.t_ns < T0 + 8.3 * SECOND]
     before = [event for event in EVENTS if event.t_ns <= T0 + 8.5 * SECOND]
-    fusion = looked_at(settings(), [event for event in before if event not in late], compiled)
-    receipts = [fusion.take(event) for event in late]
+    fusion = run_one_by_one(settings(), [event for event in before if event not in late], compiled)
+    receipts = [fusion.fuse(event) for event in late]
     assert len(receipts) > 2
     assert {receipt.outcome for receipt in receipts} == {Outcome.FUSED}
     assert 0 < fusion.history.rerun <= len([event for event in before if event.t_ns > late[0].t_ns - 50 * MS])
@@ -99,7 +99,7 @@ def test_events_that_come_late_together_are_run_once(compiled: bool) -> None:
 @LONG
 def test_events_in_order_are_run_once(compiled: bool) -> None:
     """Wheels stamped with the IMU's own instants too."""
-    fusion = looked_at(settings(), EVENTS, compiled)
+    fusion = run_one_by_one(settings(), EVENTS, compiled)
     assert any(row["t_ns"] in fusion.history.rows["t_ns"][i + 1 :] for i, row in enumerate(fusion.history.rows))
     assert fusion.history.rerun == 0
 
@@ -110,23 +110,23 @@ def test_too_old_begins_below_the_horizon(compiled: bool) -> None:
         horizon = fusion.history.settled_ns
         assert horizon == sources("imu0", events=until(2.5))[-1].t_ns - SECOND
         before = fusion.history.head.numbers.copy()
-        outcome = fusion.take(event("front_right", horizon + offset, WheelSpeed(0.05))).outcome
+        outcome = fusion.fuse(event("front_right", horizon + offset, WheelSpeed(0.05))).outcome
         assert outcome == (Outcome.TOO_OLD if too_old else Outcome.FUSED)
         assert fusion.outcomes()["front_right"]["TOO_OLD"] == too_old
         assert bool((fusion.history.head.numbers == before).all()) is too_old
 
 
 def test_duplicates(compiled: bool) -> None:
-    """The very same event, and another of its source with the same stamp: the lower sequence holds, whichever came first."""
+    """The same event again, and another one of its source with the same stamp: the lower sequence is kept in any order."""
     fusion = fuse(settings(), until(6.0), compiled)
     fix = sources("gps0.position", events=until(5.9))[-1]
-    assert fusion.take(fix).outcome == Outcome.DUPLICATE
+    assert fusion.fuse(fix).outcome == Outcome.DUPLICATE
     same_bits_but_counts(fusion, fuse(settings(), until(6.0), compiled))
     other = GnssPosition(fix.payload.latitude, fix.payload.longitude, fix.payload.height + 1.0)
     above, below = (msgspec.structs.replace(fix, sequence=fix.sequence + s, payload=other) for s in (100, -100))
-    assert fusion.take(above).outcome == Outcome.DUPLICATE
+    assert fusion.fuse(above).outcome == Outcome.DUPLICATE
     same_bits_but_counts(fusion, fuse(settings(), until(6.0), compiled))
-    assert fusion.take(below).outcome == Outcome.FUSED
+    assert fusion.fuse(below).outcome == Outcome.FUSED
     assert outcomes(fusion, "gps0.position") == {"FUSED": 30, "DUPLICATE": 3}
     replaced = sorted([e for e in until(6.0) if e is not fix] + [below], key=lambda e: e.key)
     same_bits_but_counts(fusion, fuse(settings(), replaced, compiled))
@@ -137,7 +137,7 @@ def same_bits_but_counts(a: Fusion, b: Fusion) -> None:
     np.testing.assert_array_equal(a.history.head.whole, b.history.head.whole)
 
 
-def test_a_duplicate_is_one_however_much_is_forgotten(compiled: bool) -> None:
+def test_a_duplicate_stays_one_after_rows_are_dropped(compiled: bool) -> None:
     """The first of two IMU samples at one instant is in the base snapshot, the second the first row behind it, and a late
     event makes it run again from there."""
     imu = next(event for event in EVENTS if event.source == "imu0" and event.t_ns == T0 + 6 * SECOND)
@@ -145,10 +145,10 @@ def test_a_duplicate_is_one_however_much_is_forgotten(compiled: bool) -> None:
     events = sorted([*until(6.33), second], key=lambda event: event.key)
     briefly = settings(horizon_s=0.3, snapshot_interval_s=0.01)
     fusion = fuse(briefly, events, compiled)
-    assert fusion.settled().t_ns == imu.t_ns  # forgets what it may
+    assert fusion.settled().t_ns == imu.t_ns  # drops what it can
     assert fusion.history.rows[0]["sequence"] == second.sequence
     late = event("front_right", imu.t_ns + 20 * MS, WheelSpeed(4.0))
-    assert fusion.take(late).outcome in (Outcome.FUSED, Outcome.REJECTED)
+    assert fusion.fuse(late).outcome in (Outcome.FUSED, Outcome.REJECTED)
     assert outcomes(fusion, "imu0")["DUPLICATE"] == 1
     same_bits(fusion, fuse(briefly, sorted([*events, late], key=lambda event: event.key), compiled))
 
@@ -156,24 +156,24 @@ def test_a_duplicate_is_one_however_much_is_forgotten(compiled: bool) -> None:
 def test_waits_for_the_imu(compiled: bool) -> None:
     fusion = fuse(settings(), until(6.0), compiled)
     newest = fusion.history.applied_ns
-    assert fusion.take(event("rear_left", newest + 15 * MS, WheelSpeed(10.0))).outcome == Outcome.WAITING
+    assert fusion.fuse(event("rear_left", newest + 15 * MS, WheelSpeed(10.0))).outcome == Outcome.WAITING
     assert fusion.outcomes()["rear_left"]["WAITING"] == 1
     assert fusion.history.head.stamps[T] == newest
     rest = [event for event in EVENTS if event.t_ns >= T0 + 6 * SECOND]
     for following in rest[:20]:
-        fusion.take(following)
+        fusion.fuse(following)
     assert fusion.outcomes()["rear_left"]["WAITING"] == 0
     assert fusion.history.head.stamps[T] > newest
 
 
 @LONG
 def test_a_silent_imu_does_not_stop_the_others(compiled: bool) -> None:
-    """From `imu_gap` on the filter coasts with what it has; when the IMU's samples come late, they are put in place."""
+    """After `imu_gap` the filter coasts with the other sensors. When the IMU samples arrive late, they are inserted."""
     silent = [event for event in sources("imu0") if T0 + 6 * SECOND <= event.t_ns < T0 + 7 * SECOND]
     fusion = Fusion(settings(), compiled)
     for offered in delayed(silent, 900 * MS, until(6.9)):
         if offered not in silent:
-            fusion.take(offered)
+            fusion.fuse(offered)
     head = fusion.history.head
     assert head.stamps[T_IMU] == T0 + 6 * SECOND - 20 * MS
     assert head.stamps[T] > T0 + 6.5 * SECOND
@@ -181,10 +181,10 @@ def test_a_silent_imu_does_not_stop_the_others(compiled: bool) -> None:
     assert outcomes(fusion, "rear_left")["FUSED"] > 130
     assert np.sqrt(head.covariance[3, 3]) < 1.0  # the wheels and GNSS hold it
     for sample in silent:
-        fusion.take(sample)
+        fusion.fuse(sample)
     for following in EVENTS:
         if following.t_ns >= until(6.9)[-1].t_ns and following not in silent:
-            fusion.take(following)
+            fusion.fuse(following)
     np.testing.assert_array_equal(fusion.history.head.numbers, fuse(settings(), EVENTS, compiled).history.head.numbers)
 
 
@@ -201,17 +201,17 @@ def test_an_imu_hole_that_is_never_filled(compiled: bool) -> None:
 def test_a_stamp_from_the_future_only_waits(compiled: bool) -> None:
     fusion = fuse(settings(), until(6.0), compiled)
     before = fusion.history.head.numbers.copy()
-    assert fusion.take(event("rear_left", T0 + 6 * SECOND + 150 * MS, WheelSpeed(10.0))).outcome == Outcome.WAITING
+    assert fusion.fuse(event("rear_left", T0 + 6 * SECOND + 150 * MS, WheelSpeed(10.0))).outcome == Outcome.WAITING
     np.testing.assert_array_equal(fusion.history.head.numbers, before)
 
 
-def test_a_forgotten_event_has_no_outcome_any_more(compiled: bool) -> None:
+def test_a_dropped_event_has_no_outcome(compiled: bool) -> None:
     fusion, first = Fusion(settings(), compiled), until(2.5)[0]
-    receipt = fusion.take(first)
+    receipt = fusion.fuse(first)
     assert receipt.outcome in (Outcome.FUSED, Outcome.WAITING)
     for following in until(2.5)[1:]:
-        fusion.take(following)
-    fusion.settled()  # forgets what it may
+        fusion.fuse(following)
+    fusion.settled()  # drops what it can
     with pytest.raises(LookupError, match=rf"no event of {first.source} at {first.t_ns} is kept"):
         _ = receipt.outcome
 
@@ -226,7 +226,7 @@ def test_counts_sum_to_the_events_offered(compiled: bool) -> None:
         original = EVENTS[i]
         bad = msgspec.structs.replace(original, payload=Invalid("fault"))
         for one in (original, bad) if i % 7 == 0 else (original, original) if i % 11 == 0 else (original,):
-            fusion.take(one)
+            fusion.fuse(one)
             offered += 1
             by_source[one.source] += 1
             assert sum(fusion.totals().values()) == offered
@@ -258,7 +258,7 @@ def test_memory_is_bounded() -> None:
     for k in range(60):
         for original in stretch:
             shift = k * 10 * SECOND
-            fusion.take(
+            fusion.fuse(
                 msgspec.structs.replace(original, t_ns=original.t_ns + shift, sequence=original.sequence + k * 10**6)
             )
         history = fusion.history
@@ -272,14 +272,14 @@ def test_memory_is_bounded() -> None:
 
 @LONG
 def test_settled_state(compiled: bool) -> None:
-    """It lies at most a snapshot interval before the horizon, and is what the head was then: no later event has a part."""
+    """It is at most a snapshot interval before the horizon, and equals the head of that instant whatever comes later."""
     fusion = fuse(settings(), until(8.0), compiled)
     settled = fusion.settled()
     horizon = fusion.history.settled_ns
     assert horizon - 50 * MS - 20 * MS <= settled.t_ns < horizon
     then = fuse(settings(), [event for event in EVENTS if event.t_ns <= settled.t_ns], compiled)
     assert settled.state is not None
-    expected = then.estimate_at(settled.t_ns).state
+    expected = then.solution_at(settled.t_ns).state
     assert expected is not None
     assert (settled.state.latitude, settled.state.velocity_n) == (expected.latitude, expected.velocity_n)
     np.testing.assert_array_equal(settled.state.covariance, expected.covariance)
@@ -291,45 +291,3 @@ def test_settled_before_the_first_event(compiled: bool) -> None:
     fusion = Fusion(settings(), compiled)
     assert fusion.settled().state is None
     assert fusion.history.head.stamps[T] == NEVER
-
-
-@LONG
-def test_estimates_ahead_leave_no_trace(compiled: bool) -> None:
-    fusion, plain = Fusion(settings(), compiled), fuse(settings(), until(6.0), compiled)
-    for offered in until(6.0):
-        fusion.take(offered)
-        fusion.estimate_at(offered.t_ns + 30 * MS)
-        fusion.settled()
-    same_bits(fusion, plain)
-
-
-@pytest.mark.parametrize(
-    ("payload", "source", "reason"),
-    [
-        (ImuSample((float("nan"), 0.0, -9.8), (0.0, 0.0, 0.0)), "imu0", "not finite"),
-        (ImuSample((0.0, 0.0, -9.8), (0.0, float("inf"), 0.0)), "imu0", "not finite"),
-        (ImuSample((0.0, 0.0, -161.0), (0.0, 0.0, 0.0)), "imu0", "range"),
-        (ImuSample((0.0, 0.0, -9.8), (0.0, 36.0, 0.0)), "imu0", "range"),
-        (GnssPosition(float("nan"), 0.2, 500.0), "gps0.position", "not finite"),
-        (GnssPosition(0.8, 0.2, 500.0, float("nan")), "gps0.position", "not finite"),
-        (GnssPosition(0.8, 0.2, 500.0, float("inf"), 1.0), "gps0.position", "not finite"),
-        (GnssPosition(1.6, 0.2, 500.0), "gps0.position", "impossible position"),
-        (GnssPosition(0.8, 0.2, 200_000.0), "gps0.position", "impossible position"),
-        (WheelSpeed(float("-inf")), "rear_left", "not finite"),
-        (WheelSpeed(1001.0), "rear_left", "impossible speed"),
-        (Invalid("checksum"), "rear_left", "checksum"),
-    ],
-)
-def test_bad_data_is_counted_with_its_reason(compiled: bool, payload: Payload | Invalid, source: str, reason: str) -> None:
-    fusion = fuse(settings(), until(2.0), compiled)
-    before = fusion.history.head.numbers.copy()
-    receipt = fusion.take(event(source, T0 + 2 * SECOND, payload))
-    assert receipt.outcome == Outcome.INVALID
-    assert reason in receipt.reason
-    assert fusion.invalid[source][receipt.reason] == fusion.outcomes()[source]["INVALID"] == 1
-    np.testing.assert_array_equal(fusion.history.head.numbers, before)
-
-
-def test_unknown_source() -> None:
-    with pytest.raises(ValueError, match=r"no source 'radar0'.*front_left"):
-        Fusion(settings()).take(event("radar0", T0, WheelSpeed(1.0)))

@@ -31,7 +31,7 @@ def departing(heading: float, speed: float = 6.0, seconds: float = 13.0) -> Driv
 
 def yaw_error(fusion: Fusion, truth: Drive) -> tuple[float, float]:
     """Error of the published yaw at the end of a drive, and its sigma [rad]."""
-    estimate = fusion.estimate_at(T0 + round(truth.seconds[-1] * SECOND)).state
+    estimate = fusion.solution_at(T0 + round(truth.seconds[-1] * SECOND)).state
     assert estimate is not None, "there is a state at the end"
     forward_n = mat_ne(truth.position_e[-1]) @ truth.mat_eb[-1][:, 0]
     off = estimate.euler()[2] - math.atan2(forward_n[1], forward_n[0])
@@ -81,12 +81,12 @@ def test_at_rest_it_waits_and_then_runs(compiled: bool) -> None:
     truth = departing(2.0, seconds=6.0)
     fusion, phases = Fusion(config(), compiled), []
     for event in measurements(truth):
-        fusion.take(event)
+        fusion.fuse(event)
         if not phases or phases[-1][1] != fusion.history.head.stamps[PHASE]:
             phases.append((float(fusion.history.head.stamps[T] - T0) / SECOND, int(fusion.history.head.stamps[PHASE])))
     assert [phase for _, phase in phases][-2:] == [CHOOSING, RUNNING]
     assert PULLS_AWAY_S < phases[-1][0] < PULLS_AWAY_S + 2.5
-    assert fusion.estimate_at(T0 + 2 * SECOND).mode is not Mode.LOST
+    assert fusion.solution_at(T0 + 2 * SECOND).mode is not Mode.LOST
     assert not fusion.history.head.bank.any()  # nothing of it is left
 
 

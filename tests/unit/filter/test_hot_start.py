@@ -95,14 +95,14 @@ def shifted(events: list[Measurement], by_ns: int) -> list[Measurement]:
 def hot(events: list[Measurement], kept: StoredState, compiled: bool | None = None) -> Fusion:
     fusion = Fusion(config(), compiled, kept)
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
     return fusion
 
 
 def off(fusion: Fusion, truth: Drive) -> tuple[float, float]:
     """Error of the yaw told at the newest instant, and its sigma [rad]."""
     head = fusion.history.head
-    estimate = fusion.estimate_at(int(head.stamps[T])).state
+    estimate = fusion.solution_at(int(head.stamps[T])).state
     assert estimate is not None
     forward_n = mat_ne(truth.position_e[-1]) @ truth.mat_eb[-1][:, 0]
     error = estimate.euler()[2] - math.atan2(forward_n[1], forward_n[0])
@@ -113,14 +113,14 @@ def test_where_it_stood_it_has_a_state_at_once(compiled: bool) -> None:
     truth, events = later(seconds=1.3)
     fusion, told = Fusion(config(), compiled, stored()), []
     for event in events:
-        fusion.take(event)
-        if event.source == "gps0.velocity" and fusion.estimate_at(event.t_ns).mode is Mode.NOMINAL:
+        fusion.fuse(event)
+        if event.source == "gps0.velocity" and fusion.solution_at(event.t_ns).mode is Mode.NOMINAL:
             told.append((event.t_ns - events[0].t_ns) / SECOND)
     assert told[0] < 1.3  # the first fix after the 0.8 s of leveling
     assert fusion.hot_start() is Verdict.USED
     error, sigma = off(fusion, truth)
     assert abs(error) < 3 * sigma < math.radians(15.0)
-    estimate = fusion.estimate_at(int(fusion.history.head.stamps[T])).state
+    estimate = fusion.solution_at(int(fusion.history.head.stamps[T])).state
     assert estimate is not None
     away = mat_ne(truth.position_e[-1]) @ (
         ecef(estimate.latitude, estimate.longitude, estimate.height) - truth.position_e[-1]
@@ -157,14 +157,14 @@ def test_a_wrong_heading_is_withdrawn_soon() -> None:
     truth, events = later(math.radians(90.0), 8.0)
     fusion, wrong, resets = Fusion(config(), True, stored()), [], []
     for event in events:
-        fusion.take(event)
-        estimate = fusion.estimate_at(event.t_ns).state
+        fusion.fuse(event)
+        estimate = fusion.solution_at(event.t_ns).state
         second = (event.t_ns - events[0].t_ns) / SECOND
         if estimate is not None:
             forward_n = mat_ne(truth.position_e[0]) @ truth.mat_eb[min(truth.at(second), len(truth.seconds) - 1)][:, 0]
             error = abs((estimate.euler()[2] - math.atan2(forward_n[1], forward_n[0]) + math.pi) % (2 * math.pi) - math.pi)
             wrong.append((second, error > 3 * estimate.sigma_yaw()))
-            resets.append(fusion.estimate_at(event.t_ns).resets)
+            resets.append(fusion.solution_at(event.t_ns).resets)
     assert max(second for second, is_wrong in wrong if is_wrong) < PULLS_AWAY_S + 1.5
     assert (resets[0], resets[-1]) == (0, 1)  # what is published jumps
     assert fusion.history.head.stamps[RESET_REASON] == ResetReason.HEADING_DECIDED
@@ -176,7 +176,7 @@ def test_elsewhere_the_heading_is_ignored(compiled: bool) -> None:
     fusion = hot(events, stored(), compiled)
     assert fusion.hot_start() is Verdict.MOVED
     head = fusion.history.head
-    assert fusion.estimate_at(int(head.stamps[T])).state is None
+    assert fusion.solution_at(int(head.stamps[T])).state is None
     assert head.stamps[PHASE] == CHOOSING and head.bank[STORED, 0] == 0
     assert head.hypothesis(0).nominal[WHEEL_SCALE] == pytest.approx(stored().calibrations[0], abs=1e-3)
 
@@ -192,7 +192,7 @@ def first_weight(events: list[Measurement], kept: StoredState) -> tuple[float, V
     """Of the stored heading, when the bank begins."""
     fusion = Fusion(config(), None, kept)
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
         if fusion.history.head.stamps[PHASE] == CHOOSING:
             break
     head = fusion.history.head
@@ -209,7 +209,7 @@ def test_what_agrees_in_part_is_one_hypothesis_of_many() -> None:
     assert first_weight(later()[1], moving) == (0.0, Verdict.IN_MOTION)
     vague = msgspec.structs.replace(kept, yaw_variance=1.0)
     assert first_weight(later()[1], vague) == (0.0, Verdict.VAGUE)
-    assert hot(later()[1], tilted).estimate_at(stored().t_ns + HOUR + 2 * SECOND).state is None  # not told before it is sure
+    assert hot(later()[1], tilted).solution_at(stored().t_ns + HOUR + 2 * SECOND).state is None  # not told before it is sure
 
 
 def test_without_a_stored_state_there_is_no_verdict() -> None:
@@ -228,7 +228,7 @@ def test_a_given_heading_goes_first() -> None:
     _, events = later()
     fusion = Fusion(config(filter={"heading_deg": 100.0}), None, stored())
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
     assert fusion.hot_start() is Verdict.OTHERWISE_KNOWN
     assert fusion.history.head.nominal[WHEEL_SCALE] == pytest.approx(stored().calibrations[0], abs=1e-3)
 
@@ -277,12 +277,12 @@ def test_a_later_start_is_not_hot() -> None:
     given = config(filter={"heading_deg": 0.0})
     fusion = Fusion(given, None, stored())
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
     assert fusion.history.head.stamps[PHASE] == RUNNING
     fusion.history.head.nominal[WHEEL_SCALE] = 0.05  # learnt since
     phases = []
     for event in shifted([event for event in events if event.t_ns < events[0].t_ns + 1.2 * SECOND], 60 * SECOND):
-        fusion.take(event)
+        fusion.fuse(event)
         phases.append(fusion.history.head.stamps[PHASE])
     head = fusion.history.head
     assert ALIGNING in phases and phases[-1] == CHOOSING

@@ -45,7 +45,7 @@ def straight(seconds: float, speed: float, acceleration: float = 0.0) -> Drive:
 def start(fusion: Fusion, events: list[Measurement]) -> float:
     """Feed events until the filter runs; the instant at which it started [s]."""
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
         if fusion.history.head.stamps[PHASE] == RUNNING:
             return float(fusion.history.head.stamps[T_START] - T0) / SECOND
     raise AssertionError("the filter did not start")
@@ -53,7 +53,7 @@ def start(fusion: Fusion, events: list[Measurement]) -> float:
 
 def attitude(fusion: Fusion) -> tuple[float, float, float]:
     """Roll, pitch, yaw [deg]."""
-    estimate = fusion.estimate_at(int(fusion.history.head.stamps[T])).state
+    estimate = fusion.solution_at(int(fusion.history.head.stamps[T])).state
     assert estimate is not None
     roll, pitch, yaw = np.degrees(estimate.euler())
     return float(roll), float(pitch), float(yaw)
@@ -91,7 +91,7 @@ def test_at_rest_with_a_given_heading(compiled: bool) -> None:
 def test_at_rest_without_a_heading_it_waits(compiled: bool) -> None:
     fusion = fuse(config(), measurements(straight(4.0, 0.0)), compiled)
     assert fusion.history.head.stamps[PHASE] == CHOOSING
-    estimate = fusion.estimate_at(T0 + 4 * SECOND)
+    estimate = fusion.solution_at(T0 + 4 * SECOND)
     assert (estimate.mode, estimate.state) == (Mode.ALIGNING, None)
     assert fusion.totals()["FUSED"] == sum(fusion.totals().values())
 
@@ -112,7 +112,7 @@ def test_in_motion_by_the_course(compiled: bool) -> None:
 def test_slow_motion_has_no_course(compiled: bool) -> None:
     fusion = fuse(config(filter={"course_speed_mps": 5.0}), measurements(straight(3.0, 4.5)), compiled)
     assert fusion.history.head.stamps[PHASE] == CHOOSING
-    assert fusion.estimate_at(T0 + 3 * SECOND).state is None
+    assert fusion.solution_at(T0 + 3 * SECOND).state is None
 
 
 @pytest.mark.parametrize("heading", [{}, GIVEN], ids=["by course", "given"])
@@ -150,7 +150,7 @@ def test_gyro_bias_of_a_standstill(compiled: bool) -> None:
     np.testing.assert_allclose(head.nominal[GYRO_BIAS_B], bias, atol=5e-3)  # noise of 0.014 rad/s over half a second
     np.testing.assert_allclose(np.sqrt(np.diag(head.covariance)[GYRO_BIAS]), math.radians(0.05))
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
     np.testing.assert_allclose(fusion.history.head.nominal[GYRO_BIAS_B], bias, atol=1.5e-3)
 
 
@@ -226,7 +226,7 @@ def test_an_autopilot_that_reboots_in_a_bend(compiled: bool, silence_s: float, r
     np.testing.assert_allclose(head.nominal[VELOCITY_E], truth.velocity_e[-1], atol=0.3)
     off = attitude(fusion)[2] - math.degrees(HEADING + 0.2 * 18.0)
     assert abs((off + 180) % 360 - 180) < 2.5
-    assert {belief.status for belief in fusion.beliefs(int(head.stamps[T])).values()} <= {"nominal", "noisy"}
+    assert {belief.status for belief in fusion.health(int(head.stamps[T])).values()} <= {"nominal", "noisy"}
 
 
 def test_a_reboot_on_the_spot_costs_nothing(compiled: bool) -> None:
@@ -248,7 +248,7 @@ def test_a_lost_heading_is_not_found_by_coasting(compiled: bool) -> None:
     assert before > LOST_HEADING**2
     for event in back:
         if event.t_ns >= T0 + 10 * SECOND:
-            fusion.take(event)
+            fusion.fuse(event)
     head = fusion.history.head
     assert head.stamps[RESETS] == 0
     assert yaw_variance(head) >= before
@@ -289,11 +289,11 @@ def test_calibration_survives_a_gap(compiled: bool) -> None:
     fusion = fuse(config(), events, compiled)
     learnt = fusion.history.head.nominal[GYRO_BIAS_B].copy()
     imu = next(event for event in events if isinstance(event.payload, ImuSample))
-    fusion.take(later([imu], 7200 * SECOND)[0])
+    fusion.fuse(later([imu], 7200 * SECOND)[0])
     head = fusion.history.head
     assert head.stamps[PHASE] == ALIGNING
     np.testing.assert_array_equal(head.nominal[GYRO_BIAS_B], learnt)
-    assert fusion.estimate_at(int(head.stamps[T])).state is None
+    assert fusion.solution_at(int(head.stamps[T])).state is None
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf])
@@ -310,10 +310,10 @@ def test_a_state_that_is_not_finite_is_emptied(compiled: bool, place: str, poiso
     rest = [event for event in events if event.t_ns >= T0 + 4 * SECOND]
     with np.errstate(invalid="ignore"):
         for event in rest:
-            outcome = fusion.take(event).outcome
+            outcome = fusion.fuse(event).outcome
             assert outcome in (Outcome.FUSED, Outcome.REJECTED, Outcome.WAITING)
             if head.stamps[BLOWN]:
-                estimate = fusion.estimate_at(event.t_ns).state
+                estimate = fusion.solution_at(event.t_ns).state
                 assert estimate is None or math.isfinite(sum(estimate.velocity_n) + estimate.covariance.sum())
     assert (head.stamps[BLOWN], head.stamps[RESETS], head.stamps[PHASE]) == (1, 1, RUNNING)
     assert head.stamps[RESET_REASON] == ResetReason.NOT_FINITE

@@ -172,9 +172,9 @@ def test_wheels_do_not_tell_the_heading() -> None:
     first = [event for event in measurements(truth) if event.source.startswith("gps0") and event.t_ns < T0 + 2 * SECOND]
     fusion, sigmas = Fusion(config(filter=FACING | {"heading_sigma_deg": 5.0})), []
     for event in sorted(events + first, key=lambda event: event.key):
-        fusion.take(event)
+        fusion.fuse(event)
         if event.source == "imu0" and event.sequence % 500 == 0 and event.t_ns > T0 + 4 * SECOND:
-            state = fusion.estimate_at(event.t_ns).state
+            state = fusion.solution_at(event.t_ns).state
             assert state is not None
             sigmas.append(math.degrees(state.sigma_yaw()))
     assert all(later > 0.95 * earlier for earlier, later in itertools.pairwise(sigmas))  # but for the second order

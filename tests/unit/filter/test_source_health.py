@@ -124,11 +124,11 @@ def named(fusion: Fusion, events: list[Measurement], source: str) -> tuple[float
     """When a source is first called something else than nominal, what, and what the others are called meanwhile."""
     when, what, others, look_ns = None, "nominal", set(), 0
     for event in events:
-        fusion.take(event)
+        fusion.fuse(event)
         if event.t_ns < look_ns:
             continue
         look_ns = event.t_ns + SECOND // 20
-        found = {name: belief.status for name, belief in fusion.beliefs(event.t_ns).items()}
+        found = {name: belief.status for name, belief in fusion.health(event.t_ns).items()}
         if found[source] != "nominal" and when is None and event.t_ns >= T0 + FAULT_S * SECOND:
             when, what = (event.t_ns - T0) / SECOND - FAULT_S, found[source]
         others |= {f"{name} {status}" for name, status in found.items() if status != "nominal" and name != source}
@@ -162,7 +162,7 @@ def shifted(event: Measurement, north: float, speed: float) -> Payload:
 
 def miss(fusion: Fusion, truth: Drive) -> float:
     """Horizontal error at the end [m]."""
-    found = fusion.estimate_at(T0 + round(truth.seconds[-1] * SECOND)).state
+    found = fusion.solution_at(T0 + round(truth.seconds[-1] * SECOND)).state
     assert found is not None
     off = ecef(found.latitude, found.longitude, found.height) - truth.position_e[-1]
     return float(np.linalg.norm((mat_ne(truth.position_e[-1]) @ off)[:2]))
@@ -212,7 +212,7 @@ def test_a_jump_of_twenty_metres_is_rejected() -> None:
     assert when is not None
     assert when < 2.0
     assert miss(fusion, truth) < 5.0
-    assert fusion.estimate_at(events[-1].t_ns).resets == 0
+    assert fusion.solution_at(events[-1].t_ns).resets == 0
 
 
 @needs_compiled
@@ -247,11 +247,11 @@ def test_after_an_outage_it_is_believed_again() -> None:
 
     fusion, shared = Fusion(settings), []
     for event in faulty(truth, fixes):
-        fusion.take(event)
+        fusion.fuse(event)
         if event.t_ns > T0 + 55 * SECOND and event.source == "gps0.position":
             shared.append(fusion.outcomes()["gps0.position"]["REJECTED"])
     assert shared[-1] == shared[0] > 0  # at first not, and from 5 s on always
-    found = fusion.estimate_at(T0 + 70 * SECOND).state
+    found = fusion.solution_at(T0 + 70 * SECOND).state
     assert found is not None
     off_n = mat_ne(truth.position_e[-1]) @ (ecef(found.latitude, found.longitude, found.height) - truth.position_e[-1])
     assert np.linalg.norm(off_n[:2] - (18.0, 0.0)) < 2.0
@@ -271,12 +271,12 @@ def test_a_ferry_carries_the_car(compiled: bool, gets_under_way_s: float) -> Non
     fusion = fuse(settings, events, compiled)
     assert np.linalg.norm(fusion.history.head.nominal[VELOCITY_E] - truth.velocity_e[-1]) < 0.5
     assert miss(fusion, truth) < 4.0
-    beliefs = fusion.beliefs(int(fusion.history.head.stamps[T]))
+    beliefs = fusion.health(int(fusion.history.head.stamps[T]))
     assert {beliefs[source].status for source in ("gps0.position", "gps0.velocity")} == {"nominal"}
 
 
 def test_sources_that_were_never_heard(compiled: bool) -> None:
     events = [event for event in measurements(town(6.0, rate=50.0)) if event.source != "rear_right"]
     fusion = fuse(config(), events, compiled)
-    assert fusion.beliefs(T0 + 6 * SECOND)["rear_right"].status == "absent"
+    assert fusion.health(T0 + 6 * SECOND)["rear_right"].status == "absent"
     assert fusion.history.head.memory[:, [NOISY, BIASED, FROZEN]].max() < 0.5

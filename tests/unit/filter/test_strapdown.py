@@ -172,7 +172,7 @@ def test_the_whole_filter_drives_across(compiled: bool, place: tuple[float, floa
     assert position < 0.05
     assert velocity < 0.01
     assert attitude < math.radians(0.3)
-    estimate = fusion.estimate_at(T0 + 10 * SECOND).state
+    estimate = fusion.solution_at(T0 + 10 * SECOND).state
     assert estimate is not None
     np.testing.assert_allclose(ecef(estimate.latitude, estimate.longitude, estimate.height), path.at(10.0)[0], atol=0.05)
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusiond.config.schema import Encoding
+from fusiond.config.outputs import Encoding
 from fusiond.messages.codec import decode, encode, schemas
 from fusiond.messages.types import StateMessage
 from tests.helpers.estimates import message, numbers, state

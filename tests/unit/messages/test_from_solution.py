@@ -10,15 +10,15 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from fusiond.config.schema import Encoding
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.config.outputs import Encoding
+from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.codec import decode, encode
 from fusiond.messages.csv import csv_row
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import StateMessage
 from tests.helpers.estimates import COUNTS, T_NS, message, numbers, state
 
-VECTORS = [field.name for field in dataclasses.fields(StateEstimate) if field.name != "covariance"]
+VECTORS = [field.name for field in dataclasses.fields(SolutionState) if field.name != "covariance"]
 
 
 def test_sigmas_and_blocks_are_those_of_the_covariance() -> None:
@@ -52,7 +52,7 @@ def test_numpy_numbers_are_published_as_numbers() -> None:
 
 
 def test_while_aligning_there_is_no_state() -> None:
-    sent = state_message(Estimate(T_NS, Mode.ALIGNING, None, 0, None), "rover", COUNTS)
+    sent = state_message(Solution(T_NS, Mode.ALIGNING, None, 0, None), "rover", COUNTS)
     assert (sent.state, sent.age_ms, sent.fault) == (None, None, None)
     assert csv_row(sent) == "1700000000123456" + "," * 15 + "aligning"
     assert json.loads(encode(sent, "json"))["state"] is None

@@ -97,14 +97,14 @@ def test_pictures_are_used_and_small() -> None:
         assert picture.stat().st_size <= LARGEST_PICTURE
 
 
-def test_the_least_configuration_is_one(tmp_path: Path) -> None:
+def test_the_smallest_configuration_is_valid(tmp_path: Path) -> None:
     (tmp_path / "car.dbc").touch()
     (example,) = examples("configuration.md", "toml")
     parsed = config.parse(example, tmp_path / "car.toml")
     assert parsed.sources() == ("gps0.position", "gps0.velocity", "imu0", "rear_left")
 
 
-def test_the_examples_of_the_workshop_guide_hold(tmp_path: Path) -> None:
+def test_the_examples_of_the_workshop_guide_are_valid(tmp_path: Path) -> None:
     (tmp_path / "car.dbc").touch()
     first, wheel = examples("tuning.md", "toml")
     parsed = config.parse(f"{first}\n{wheel}", tmp_path / "car.toml")
@@ -131,7 +131,7 @@ def test_the_walk_through_names_files_of_the_tree() -> None:
     assert all((ROOT / name).is_file() for name in named)
 
 
-def test_the_example_of_a_scenario_is_one() -> None:
+def test_the_example_of_a_scenario_is_valid() -> None:
     (example,) = examples("simulator.md", "toml")
     assert scenario.parse(example).duration_s == 90
 

@@ -1,4 +1,4 @@
-"""The project's own rules: packages as listed, every module says what it is for, the bundled drive is up to date."""
+"""Rules of the project: packages are listed, every module says what it is for, the bundled drive is up to date."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 
 from fusiond.app.demo import demo
 from fusiond.simulation import matching, scenario
+from fusiond.units import nanoseconds
 from tests.helpers.paths import ROOT, ROOTS
 
 MODULES = sorted(path for root in ROOTS.values() for path in root.rglob("*.py"))
@@ -47,4 +48,4 @@ def test_the_bundled_drive_is_complete_small_and_up_to_date() -> None:
     again = "; run `make demo-data` again"
     assert files["fusiond.toml"].read_text(encoding="utf-8") == matching.configuration(drive, "wheels.dbc"), again
     assert files["wheels.dbc"].read_text(encoding="utf-8") == matching.dbc(drive), again
-    assert round(drive.duration_s * 1e9) == demo.LENGTH_NS
+    assert nanoseconds(drive.duration_s) == demo.LENGTH_NS

@@ -1,4 +1,4 @@
-"""The study's own parts: its world meets the filter's model, its bound is that of a filter whose covariance is known."""
+"""Parts of the study: its world matches the filter's model, and its bound is right for a filter with a known covariance."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def errors(fusion: Fusion, world: World, sensors: Sensors, looks: list[float]) -
 
 @needs_compiled
 def test_without_noise_the_filter_follows_the_world() -> None:
-    """Positions, velocities, rates and forces of the world are of one piece, slip and drawn mount included."""
+    """Positions, velocities, rates and forces of the world agree with each other, slip and random mount included."""
     random = np.random.default_rng(1)
     config = nominal.config(**QUIET)
     world, fusion = World(nominal.scenario(course=COURSE), config, random), Fusion(config, True)

@@ -10,6 +10,7 @@ import pytest
 from fusiond.config.toml import ConfigError
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.scenario import load, parse
+from fusiond.units import SECOND
 from fusiond_adapters.logs.write import write_drive
 from tests.helpers.paths import ROOT
 from tests.helpers.simulated import REST
@@ -23,7 +24,7 @@ def test_demo_scenario_drives_what_its_comments_say(tmp_path: Path) -> None:
     assert demo.duration_s == 150
     assert np.abs(drive.truth.speed).max() == pytest.approx(20)
     standing = drive.truth.t_ns[np.abs(drive.truth.speed) == 0]
-    assert ((standing - demo.start_ns) / 1e9 < 8.01).sum() == 801
+    assert ((standing - demo.start_ns) / SECOND < 8.01).sum() == 801
     t = (drive.gnss.time_us - demo.start_ns // 1000) / 1e6
     assert not ((t >= 54) & (t < 69)).any()
     assert sum(path.stat().st_size for path in write_drive(demo, tmp_path)) < 3_000_000

@@ -1,4 +1,4 @@
-"""Every way in which a stamp reaches the time line: Unix, boot, pairs, none; duplicates, drift, order."""
+"""Alignment of every kind of stamp: Unix, boot, pairs, none; duplicates, drift, order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from fusiond.events import (
     Received,
     WheelSpeed,
 )
-from fusiond.timeline.clock import FUTURE_TOLERANCE, Clock
+from fusiond.timeline.aligner import FUTURE_TOLERANCE
+from fusiond.timeline.clock import Clock
 from tests.helpers.clocks import (
     BOOT,
     FIX,
@@ -89,7 +90,7 @@ def test_plausible_unix_stamps_are_trusted() -> None:
 
 
 @pytest.mark.parametrize("off", [5 * SECOND, -5 * SECOND, -300 * MS, 40 * YEAR, -40 * YEAR])
-def test_host_off_unix_time_falls_back_to_the_least_offset(off: int) -> None:
+def test_a_host_that_is_not_on_unix_time_falls_back_to_the_least_offset(off: int) -> None:
     clock = Clock(Config())
     rng = random.Random(1)
     for i in range(600):
@@ -177,7 +178,7 @@ def test_system_time_that_contradicts_other_unix_stamps_is_refused() -> None:
     assert (report[BOOT].method, report[BOOT].note) == ("least_offset", "SYSTEM_TIME refused: stamped in the future")
 
 
-def test_one_odd_pair_is_left_out() -> None:
+def test_one_odd_pair_is_ignored() -> None:
     clock = Clock(Config())
     feed_with_pairs(clock, SECOND, 11 * SECOND)
     clock.align(system_time(T0 + 11 * SECOND, 10_900 * MS, T0 + 11 * SECOND + 5 * MS))
@@ -197,7 +198,7 @@ def test_a_step_of_the_unix_clock_is_followed_by_its_pairs() -> None:
 
 
 @pytest.mark.parametrize(("unix", "boot"), [(0, SECOND), (T0, 0), (-1, -1), (None, SECOND)])
-def test_absurd_pairs_teach_nothing(unix: int | None, boot: int) -> None:
+def test_nothing_is_learnt_from_absurd_pairs(unix: int | None, boot: int) -> None:
     clock = Clock(Config())
     assert clock.align(Received("system_time", 0, "unix", unix, T0, ClockPair(BOOT, boot))) is None
     assert clock.report() == {}
@@ -257,7 +258,7 @@ def test_order_survives_any_jitter(received: list[Received]) -> None:
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.integers(-3, 3 * 10**10), st.integers(0, 10**8), st.booleans()), max_size=40))
 def test_nothing_lies_far_after_its_receipt(pairs: list[tuple[int, int, bool]]) -> None:
-    """Whatever comes: no error, a stamp not after the receipt, and the same again from the same input."""
+    """For any input: no error, no stamp far after its receipt, and the same result from the same input."""
     clock, twin = Clock(Config()), Clock(Config())
     receive = T0
     for stamp, elapsed, unix in pairs:
@@ -281,7 +282,7 @@ def test_a_stamp_that_is_not_positive_is_invalid(stamp: int) -> None:
     assert measured(clock, imu(stamp, T0)).t_ns == T0
 
 
-def test_an_invalid_payload_is_stamped_and_teaches_nothing() -> None:
+def test_an_invalid_payload_is_stamped_but_not_learnt_from() -> None:
     clock = Clock(Config())
     no_fix = Invalid("no fix")
     assert clock.align(Received("gps0.position", 3, "unix", T0 - YEAR, T0, no_fix)) == Measurement(

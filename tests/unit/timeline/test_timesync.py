@@ -1,4 +1,4 @@
-"""TIMESYNC in the clock: a boot clock measured by round trips, what spoils them, and Unix time by way of it."""
+"""TIMESYNC: a boot clock measured by round trips, what disturbs them, and Unix time by way of it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from fusiond.config.load import parse
 from fusiond.events import HOST_CLOCK, ClockPair, ImuSample, Measurement, Received
 from fusiond.timeline.clock import Clock
 from fusiond.timeline.timesync import DEVIATIONS, RoundTrips
+from fusiond.units import MILLISECOND as MS
+from fusiond.units import SECOND
 
-T0 = 1_700_000_000 * 10**9
-MS = 1_000_000
-SECOND = 1000 * MS
+T0 = 1_700_000_000 * SECOND
 BOOT = "fc/1/boot"
 SAMPLE = ImuSample((0.0, 0.0, -9.8), (0.0, 0.0, 0.0))
 CONFIG = parse('[mavlink.fc]\n[imu.imu0]\nlink = "fc"\n[gnss.gps0]\nlink = "fc"')
@@ -46,17 +46,17 @@ def drive(clock: Clock, start: int, seconds: float, *, zero: int = T0, latency: 
     return error
 
 
-def test_round_trips_see_the_latency_that_receipts_hide() -> None:
+def test_round_trips_measure_the_latency_that_receipts_cannot() -> None:
     clock = Clock(CONFIG)
     assert abs(drive(clock, SECOND, 5)) < MS // 10
     report = clock.report()[BOOT]
     assert (report.method, report.note, report.resets) == ("timesync", "", 0)
-    assert abs(drive(Clock(CONFIG), SECOND, 5, trip=11 * MS)) == 40 * MS  # too slow to tell
+    assert abs(drive(Clock(CONFIG), SECOND, 5, trip=11 * MS)) == 40 * MS  # round trips this slow are not used
 
 
-def test_the_quickest_ways_there_and_back_count() -> None:
+def test_the_fastest_request_and_the_fastest_reply_count() -> None:
     trips = RoundTrips()
-    for k in range(100):  # one way alone is delayed at a time
+    for k in range(100):  # only one way is delayed at a time
         sent, there, back = T0 + k * SECOND, (k % 7) * MS, (3 * k % 5) * MS
         trips.add(sent + 100_000 + there, sent, sent + 200_000 + there + back)
     assert trips.at(T0 + 100 * SECOND) == pytest.approx(0, abs=1000)
@@ -70,7 +70,7 @@ def test_drift_is_followed() -> None:
     assert trips.at(T0 + 600 * SECOND) == pytest.approx((T0 + 600 * SECOND) // 20_000, abs=100_000)
 
 
-def test_a_stray_answer_changes_nothing_but_a_row_of_them_does() -> None:
+def test_one_stray_answer_changes_nothing_but_consecutive_ones_do() -> None:
     trips = RoundTrips()
 
     def ask(k: int, offset: int) -> None:
@@ -84,7 +84,7 @@ def test_a_stray_answer_changes_nothing_but_a_row_of_them_does() -> None:
         assert trips.at(k * SECOND) == 0
         ask(k, SECOND)
         if k == 11:
-            ask(k, 0)  # a good one in between breaks the row
+            ask(k, 0)  # a good one in between resets the count
     assert trips.at(20 * SECOND) == 0
     ask(20, SECOND)
     assert trips.at(20 * SECOND) == SECOND
@@ -108,7 +108,7 @@ def test_answers_of_another_clock_are_refused() -> None:
 
 
 @pytest.mark.parametrize("wrong", [0, 300 * MS, -400 * MS, 5000 * SECOND, -(10**6) * SECOND])
-def test_a_wrong_host_clock_puts_unix_and_boot_stamps_where_they_belong(wrong: int) -> None:
+def test_unix_and_boot_stamps_are_right_if_the_host_clock_is_wrong(wrong: int) -> None:
     """The host's clock is ahead of Unix time by `wrong`: each stamp still gives the host's own instant."""
     clock = Clock(CONFIG)
     boot_error = unix_error = 0

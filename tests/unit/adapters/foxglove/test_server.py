@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from fusiond.config.schema import Foxglove
+from fusiond.config.outputs import Foxglove
 from fusiond.messages.codec import encode
 from fusiond.messages.types import EventMessage, InnovationMessage, StateMessage
 from fusiond.units import SECOND

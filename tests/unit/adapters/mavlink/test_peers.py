@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import common
 
 from fusiond.app.replay.replay import Replay, Wants
 from fusiond.messages.codec import encode
-from fusiond.timeline.clock import ClockReport
+from fusiond.timeline.aligner import ClockReport
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers.live import SYSTEM, Running, configuration, running
 from tests.helpers.network import DEADLINE, free_port

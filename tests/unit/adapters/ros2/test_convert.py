@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fusiond.config.schema import Ros2
+from fusiond.config.outputs import Ros2
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import (
     HealthMessage,

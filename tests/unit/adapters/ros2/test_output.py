@@ -15,7 +15,8 @@ import xxhash
 import zenoh
 from numpy.testing import assert_allclose
 
-from fusiond.config.schema import Config, Ros2, Zenoh
+from fusiond.config.outputs import Ros2, Zenoh
+from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.maths.rotation import matrix
 from fusiond.messages.local_frame import LocalFrame, LocalState

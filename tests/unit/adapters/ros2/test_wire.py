@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fusiond.config.schema import Ros2
+from fusiond.config.outputs import Ros2
 from fusiond_adapters.ros2 import wire
 from fusiond_adapters.ros2.output import topics
 from tests.helpers.ros2 import (

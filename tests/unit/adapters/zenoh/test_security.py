@@ -14,7 +14,8 @@ import pytest
 import zenoh
 
 from fusiond.app.client import Client, ClientError
-from fusiond.config.schema import Config, Vehicle, Zenoh
+from fusiond.config.outputs import Zenoh
+from fusiond.config.schema import Config, Vehicle
 from fusiond.messages.types import EventMessage
 from fusiond_adapters.zenoh.queries import Answers
 from fusiond_adapters.zenoh.session import ZenohPublisher, open_session, session_config

@@ -10,7 +10,7 @@ from typing import get_args
 import pytest
 import zenoh
 
-from fusiond.config.schema import Encoding, Zenoh
+from fusiond.config.outputs import Encoding, Zenoh
 from fusiond.messages.codec import encode
 from fusiond.messages.csv import csv_row
 from fusiond_adapters.zenoh.session import (

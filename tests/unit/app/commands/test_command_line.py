@@ -18,7 +18,7 @@ import zenoh
 from fusiond.__main__ import INTERRUPTED, SUCCESS, UNUSABLE, USAGE, main
 from fusiond.app.demo.demo import explanation
 from fusiond.app.replay.summary import Summary
-from fusiond.config.schema import Zenoh
+from fusiond.config.outputs import Zenoh
 from fusiond.messages.codec import decode
 from fusiond.messages.csv import CSV_COLUMNS, csv_header, csv_row
 from fusiond.messages.types import StateMessage

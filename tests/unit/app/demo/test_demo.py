@@ -14,7 +14,8 @@ from msgspec.structs import replace
 from fusiond.__main__ import SUCCESS, UNUSABLE, main
 from fusiond.app.client import Client, ClientError
 from fusiond.app.demo import demo
-from fusiond.config.schema import Config, Zenoh
+from fusiond.config.outputs import Zenoh
+from fusiond.config.schema import Config
 from fusiond.messages import HealthMessage, StateMessage
 from tests.helpers.drive import LOGS, folder
 

@@ -21,7 +21,7 @@ from fusiond.app.replay.attached import attachable
 from fusiond.app.replay.replay import Replay, Wants
 from fusiond.app.replay.summary import Summary
 from fusiond.config import load as config
-from fusiond.config.schema import Zenoh
+from fusiond.config.outputs import Zenoh
 from fusiond.messages import (
     MESSAGES,
     ConfigMessage,

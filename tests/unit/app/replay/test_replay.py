@@ -124,8 +124,8 @@ def test_another_sensor_does_not_end_the_wait(setup: Config, monkeypatch: pytest
         order.append((message.t_ns - T0, engine.now_ns - T0))
 
     engine = Engine(waiting, note, rate_hz=10.0, only_states=True)
-    known = engine.fusion.receive(imu(T0))
-    monkeypatch.setattr(engine.fusion, "receive", lambda _: known)  # the other is not of this configuration
+    known = engine.fusion.feed(imu(T0))
+    monkeypatch.setattr(engine.fusion, "feed", lambda _: known)  # the other is not of this configuration
     for event in (imu(T0), other, imu(T0 + 120 * MS, 1)):
         engine.feed(event)
     assert order == [(0, 0), (120 * MS, 120 * MS)]
@@ -158,10 +158,10 @@ def test_ticks_tell_what_a_live_fusion_would(setup: Config, events: list[Receive
     event = next(waiting)
     for t_ns in checked:
         while event.t_receive_ns <= t_ns:
-            live.receive(event)
+            live.feed(event)
             event = next(waiting)
         outcomes = OutcomeCounts(**{name.lower(): count for name, count in live.totals().items()})
-        assert told[t_ns] == csv_row(state_message(live.estimate_at(t_ns), setup.vehicle.name, outcomes))
+        assert told[t_ns] == csv_row(state_message(live.solution_at(t_ns), setup.vehicle.name, outcomes))
     assert told[checked[-1]].endswith("nominal")
 
 

@@ -21,7 +21,7 @@ from fusiond.app.replay.comparison import (
     errors_of,
     parse_truth,
 )
-from fusiond.estimator.solution import Estimate, Mode, StateEstimate
+from fusiond.estimator.solution import Mode, Solution, SolutionState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import OutcomeCounts, StateMessage
 
@@ -35,7 +35,7 @@ def message(
     second: float = 0.0, mode: Mode = Mode.NOMINAL, speed: float = 0.0, sigma: tuple[float, float, float] = (3.0, 4.0, 5.0)
 ) -> StateMessage:
     """A state at 48 N 11 E that goes north, with uncorrelated position errors."""
-    state = StateEstimate(
+    state = SolutionState(
         latitude=math.radians(48.0),
         longitude=math.radians(11.0),
         height=500.0,
@@ -53,7 +53,7 @@ def message(
         sigma_wheel_scale=0.0,
         sigma_mount=(0.0, 0.0),
     )
-    return state_message(Estimate(round(second * SECOND), mode, 0, 0, state), "car", OutcomeCounts())
+    return state_message(Solution(round(second * SECOND), mode, 0, 0, state), "car", OutcomeCounts())
 
 
 # --- The truth file
@@ -150,7 +150,7 @@ def test_a_state_is_inside_its_ellipse_by_its_own_covariance() -> None:
 
 def test_nothing_is_compared_without_state_or_truth() -> None:
     assert errors_of(message(), None) is None
-    aligning = state_message(Estimate(0, Mode.ALIGNING, None, 0, None), "car", OutcomeCounts())
+    aligning = state_message(Solution(0, Mode.ALIGNING, None, 0, None), "car", OutcomeCounts())
     assert errors_of(aligning, HERE) is None
     assert Comparison().report() is None
 

@@ -20,7 +20,7 @@ import pytest
 from fusiond.__main__ import UNUSABLE, main
 from fusiond.app.top.terminal import ansi
 from fusiond.app.top.view import Line, View, plain, screen
-from fusiond.config.schema import Zenoh
+from fusiond.config.outputs import Zenoh
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import EventMessage, HealthMessage, Message, OutputHealth, StateMessage
 from fusiond_adapters.zenoh.session import ZenohPublisher, open_session

@@ -362,11 +362,11 @@ def both_kernels(
     for number, event in enumerate(events):
         for fusion in (first, second):
             poison(fusion.history.head, number)
-            fusion.take(event)
+            fusion.fuse(event)
         if number % 40 == 0 or number == len(events) - 1:
             same_bits(first, second)
             ahead = event.t_ns + number % 7 * 50 * MS
-            estimates = first.estimate_at(ahead), second.estimate_at(ahead)
+            estimates = first.solution_at(ahead), second.solution_at(ahead)
             same_state(first._carried, second._carried)
             assert estimates[0].mode is estimates[1].mode
             assert (estimates[0].state is None) == (estimates[1].state is None)
@@ -493,9 +493,9 @@ def test_a_frozen_imu() -> None:
 
     events = sensed(town(12.0, rate=25.0), change)
     frozen = fuse(config(filter=HEADED), [event for event in events if event.t_ns < T0 + 9 * SECOND], True)
-    assert frozen.beliefs(T0 + 9 * SECOND)["imu0"].status == "frozen"
+    assert frozen.health(T0 + 9 * SECOND)["imu0"].status == "frozen"
     fusion = both_kernels(config(filter=HEADED), events)
-    assert fusion.beliefs(T0 + 12 * SECOND)["imu0"].status == "nominal"
+    assert fusion.health(T0 + 12 * SECOND)["imu0"].status == "nominal"
 
 
 @pytest.mark.parametrize("before", ["imu0", "gps0.position"])
@@ -568,7 +568,7 @@ def test_faulty_sources() -> None:
         return payload
 
     fusion = both_kernels(config(filter=HEADED, wheel={"noise_most": 1.5}), sensed(town(28.0, rate=25.0), change))
-    found = fusion.beliefs(T0 + 28 * SECOND)
+    found = fusion.health(T0 + 28 * SECOND)
     assert {source: found[source].status for source in WHEELS} == {
         "rear_left": "biased",
         "front_right": "frozen",
@@ -648,7 +648,7 @@ library = hashlib.sha256(repr([x ** 2 for x in numbers] + [math.exp(-x) for x in
 print(library.hexdigest())
 for settings in (config(), config(filter={"heading_deg": 40.0}, gnss={"lever_arm_m": (0.4, 0.1, -1.0)})):
     fusion = fuse(settings, events, True)
-    head, estimate = fusion.history.head, fusion.estimate_at(T0 + 13 * SECOND)
+    head, estimate = fusion.history.head, fusion.solution_at(T0 + 13 * SECOND)
     answer = repr([f.hex() if isinstance(f, float) else f for f in (estimate.state.latitude, estimate.state.longitude,
         *estimate.state.velocity_n, *estimate.state.quaternion_nb, *estimate.state.euler())])
     for part in (head.numbers, head.whole, fusion.settled().state.covariance, estimate.state.covariance):

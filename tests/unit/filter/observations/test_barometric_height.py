@@ -128,7 +128,7 @@ def test_the_offset_is_learnt_and_steadies_the_height() -> None:
     offset, sigma = offset_of(fusion)
     assert sigma < 1.0
     assert abs(offset - OFFSET) < 3 * sigma
-    state = fusion.estimate_at(fusion.history.applied_ns).state
+    state = fusion.solution_at(fusion.history.applied_ns).state
     assert state is not None
     assert abs(state.height - MUNICH[2]) < 3 * math.sqrt(state.covariance[2, 2])
     assert fusion.outcomes()["baro"]["FUSED"] >= 298
@@ -140,7 +140,7 @@ def test_a_simulated_drive(tmp_path: Path) -> None:
     loaded = load(tmp_path / "fusiond.toml")
     fusion = Fusion(loaded)
     for received in open_logs([tmp_path / "drive.tlog", tmp_path / "drive.log"], loaded):
-        fusion.receive(received)
+        fusion.feed(received)
     offset, sigma = offset_of(fusion)
     assert sigma < 2.0
     assert abs(offset - 80.0) < 3 * sigma
@@ -157,7 +157,7 @@ def test_an_offset_that_jumps_is_learnt_anew() -> None:
     assert abs(offset - OFFSET - 60.0) < 3 * sigma + 0.5
     assert 40 <= fusion.outcomes()["baro"]["REJECTED"] <= 70
     assert fusion.history.head.stamps[RESETS] == 0
-    state = fusion.estimate_at(fusion.history.applied_ns).state
+    state = fusion.solution_at(fusion.history.applied_ns).state
     assert state is not None
     assert abs(state.height - MUNICH[2]) < 1.0
     assert np.linalg.eigvalsh(fusion.history.head.covariance).min() > -1e-9
@@ -170,8 +170,8 @@ def test_both_kernels_alike() -> None:
     chosen, met = settings(filter={"course_speed_mps": 50.0}), set()
     first, second = Fusion(chosen, True), Fusion(chosen, False)
     for event in events:
-        first.take(event)
-        second.take(event)
+        first.fuse(event)
+        second.fuse(event)
         if event.source == "baro":
             met.add(int(first.history.head.stamps[PHASE]))
     assert met >= {CHOOSING, RUNNING}
@@ -192,7 +192,7 @@ def test_shuffled_arrivals_give_the_same_bits(compiled: bool) -> None:
     shuffled = [events[i] for i in np.argsort([event.t_ns + d for event, d in zip(events, late, strict=True)])]
     fusion = Fusion(chosen, compiled)
     for number, event in enumerate(shuffled):
-        fusion.take(event)
+        fusion.fuse(event)
         if number % 8 == 0:
             fusion.outcomes()  # looked at, so that later events rewind
     same_bits(fusion, plain)

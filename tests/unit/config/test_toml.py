@@ -1,0 +1,103 @@
+"""The errors of a TOML file: each names the file, the line and the key, and lists what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fusiond.config import load as config
+from fusiond.config.toml import ConfigError
+from tests.helpers.complaints import BASE, CAR, GNSS, check, complaint
+
+
+def test_whole_numbers_serve_for_numbers() -> None:
+    assert config.parse(BASE + "[filter]\nhorizon_s = 2\n").filter.horizon_s == 2.0
+
+
+@pytest.mark.parametrize("number", ["inf", "-inf", "nan", "+nan"])
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[filter]\nhorizon_s = {}", "filter.horizon_s"),
+        ("[motion]\nlateral_sigma_mps = {}", "motion.lateral_sigma_mps"),
+        ("[motion]\npoint_m = [0.0, {}, 0.0]", "motion.point_m[1]"),
+        ("[gnss.gps0]\ndelay_ms = {}", "gnss.gps0.delay_ms"),
+        ("[publish]\nrate_hz = {}", "publish.rate_hz"),
+    ],
+)
+def test_numbers_that_are_not_finite(text: str, key: str, number: str) -> None:
+    check(BASE + text.format(number), 5, key, "must be a finite number")
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "part"),
+    [
+        ("[filter]\nhorizon_s = 0", "filter.horizon_s", "> 0"),
+        ("[filter]\nhorizon_s = 1e300", "filter.horizon_s", "<= 1000000"),
+        ("[filter]\ngate_probability = 1.0", "filter.gate_probability", "< 1"),
+        ("[filter]\nsnapshot_interval_s = -0.1", "filter.snapshot_interval_s", ">= 0"),
+        ("[filter]\nheading_deg = 361", "filter.heading_deg", "<= 360"),
+        ("[motion]\npoint_m = [0, 1]", "motion.point_m", "length 3"),
+        ("[publish]\nrate_hz = 2000", "publish.rate_hz", "<= 1000"),
+        ("[mavlink.b]\nsystem = 256", "mavlink.b.system", "<= 255"),
+        ("[gnss.gps0]\ndelay_ms = 1e9", "gnss.gps0.delay_ms", "<= 1000000"),
+        ('[filter]\nhorizon_s = "1"', "filter.horizon_s", "Expected `float`, got `str`"),
+        ("[filter]\nhorizon_s = true", "filter.horizon_s", "Expected `float`, got `bool`"),
+        ("[motion]\nnon_holonomic = 1", "motion.non_holonomic", "Expected `bool`, got `int`"),
+        ("[mavlink.b]\nbaud = 1.5", "mavlink.b.baud", "Expected `int`, got `float`"),
+        ("[can.body]\ndbc = 'car.dbc'", "can.body.dbc", "Expected `array`, got `str`"),
+    ],
+)
+def test_values_out_of_range_or_of_the_wrong_type(text: str, key: str, part: str) -> None:
+    check(BASE + text.replace("[gnss.gps0]", '[gnss.gps0]\nlink = "autopilot"'), 5 + ("gnss" in text), key, part)
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "bad", "allowed"),
+    [
+        ("[publish]\nencoding = 'xml'", "publish.encoding", "xml", ["json", "msgpack"]),
+        ("[zenoh]\nmode = 'server'", "zenoh.mode", "server", ["peer", "client", "router"]),
+        ("[gnss.gps0]\nmessage = 'GPS3'", "gnss.gps0.message", "GPS3", ["GPS_RAW_INT", "GPS2_RAW"]),
+        ("[gnss.gps0]\nstamp = 'none'", "gnss.gps0.stamp", "none", ["sensor", "arrival"]),
+        ("[wheel.w]\nunit = 'knots'", "wheel.w.unit", "knots", ["m/s", "km/h", "mph", "rad/s", "rpm"]),
+    ],
+)
+def test_a_choice_lists_what_may_be_chosen(text: str, key: str, bad: str, allowed: list[str]) -> None:
+    text = text.replace("[wheel.w]", "[wheel.w]\nbus = 'c'\nmessage = 'm'\nsignal = 's'")
+    text = text.replace("[gnss.gps0]", "[gnss.gps0]\nlink = 'autopilot'")
+    line = (BASE + text).count("\n") + 1
+    check(BASE + text, line, key, bad, "allowed: " + ", ".join(allowed))
+
+
+def test_unknown_keys_list_the_known_ones() -> None:
+    check(BASE + "[filter]\nhorizon = 1", 5, "filter.horizon", "unknown key; allowed: ", "gate_probability", "horizon_s")
+    check(BASE + "[filtre]\nhorizon_s = 1", 4, "filtre", "unknown key; allowed: ", "filter", "vehicle")
+    check(BASE + GNSS + "lever_arm = [0, 0, 0]", 6, "gnss.gps0.lever_arm", "unknown key", "lever_arm_m")
+    check("directory = 'x'\n" + BASE, 1, "directory", "unknown key")
+    assert "directory" not in complaint(BASE + "[filtre]").split("allowed")[1]
+
+
+def test_missing_keys() -> None:
+    check(BASE + "[gnss.gps0]\nmessage = 'GPS2_RAW'", 4, "gnss.gps0", "the key 'link' is missing")
+    check(BASE + "[wheel.w]\nbus = 'b'\nmessage = 'm'", 4, "wheel.w", "the key 'signal' is missing")
+
+
+def test_the_fault_is_found_in_the_right_table_of_many() -> None:
+    text = BASE + GNSS + "[gnss.gps1]\nlink = 'autopilot'\ninterval_s = -1"
+    check(text, 8, "gnss.gps1.interval_s", "> 0")
+
+
+def test_text_that_is_no_toml() -> None:
+    assert complaint("[filter\n").startswith(f"{CAR}: not valid TOML: ")
+    assert "line 2" in complaint("[filter]\nhorizon_s = \n")
+    assert "line 3" in complaint("[filter]\nhorizon_s = 1\nhorizon_s = 2\n")
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    for name, content in (("absent.toml", None), ("binary.toml", b"\xff\xfe\x00")):
+        file = tmp_path / name
+        if content is not None:
+            file.write_bytes(content)
+        with pytest.raises(ConfigError, match=name):
+            config.load(file)
