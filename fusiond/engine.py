@@ -22,7 +22,7 @@ from fusiond.events import ImuSample, Received
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.outcomes import totals
-from fusiond.messages.schedule import RATE_DENOMINATOR, Publication, Surroundings
+from fusiond.messages.schedule import RATE_DENOMINATOR, IoHealth, Publication
 from fusiond.messages.types import Message, StateMessage
 
 SECOND = 1_000_000_000  # ns
@@ -35,7 +35,7 @@ class Engine:
     """The fusion of one vehicle, its ticks, and what is published at them.
 
     `sink` takes every message, of all kinds or, with `only_states`, the states alone; without a sink there are no ticks.
-    `rate_hz` of the ticks is by default the configuration's. `surroundings` tells what the health says of the shell.
+    `rate_hz` of the ticks is by default the configuration's. `io_health` tells what the health says of the shell.
     `pace` is called with the time [ns from the first event] before each tick and each event, and may sleep. `stored` is for
     a hot start; StoredStateError where it is not for this configuration.
     """
@@ -47,12 +47,12 @@ class Engine:
         *,
         rate_hz: float | None = None,
         only_states: bool = False,
-        surroundings: Callable[[], Surroundings] = Surroundings,
+        io_health: Callable[[], IoHealth] = IoHealth,
         pace: Callable[[int], None] | None = None,
         stored: StoredState | None = None,
     ) -> None:
         self.fusion = Fusion(config, stored=stored)
-        self.publication = None if sink is None or only_states else Publication(config, self.fusion, surroundings)
+        self.publication = None if sink is None or only_states else Publication(config, self.fusion, io_health)
         self.first_ns: int | None = None  # receipt of the first event
         self.now_ns = 0  # latest receipt so far
         self.ticks = self.skipped = 0  # made, and passed over in long silences

@@ -12,7 +12,7 @@ from fusiond.filter.state import Verdict
 from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, to_text
 from fusiond.messages.types import OutputHealth
 
-MOST_BYTES = 1_000_000  # a larger file is none of ours
+MAX_BYTES = 1_000_000  # a larger file is none of ours
 
 log = logging.getLogger("fusiond")
 
@@ -21,12 +21,12 @@ def read_state(path: Path) -> StoredState | None:
     """What the file holds; None where there is none yet. Raises StoredStateError."""
     try:
         with path.open("rb") as file:
-            text = file.read(MOST_BYTES + 1)
+            text = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise StoredStateError(f"cannot be read: {error.strerror}") from error
-    if len(text) > MOST_BYTES:
+    if len(text) > MAX_BYTES:
         raise StoredStateError("torn or altered: it is too large")
     return from_text(text)
 

@@ -54,7 +54,7 @@ SEVERITY: Mapping[Mode, Severity] = {
 }
 
 
-class Surroundings(NamedTuple):
+class IoHealth(NamedTuple):
     """What the health tells of the shell around the engine."""
 
     latency: LatencyHealth = LatencyHealth()
@@ -63,10 +63,10 @@ class Surroundings(NamedTuple):
 
 
 class Publication:
-    """What is published besides the states. `surroundings` is asked whenever a health is made."""
+    """What is published besides the states. `io_health` is asked whenever a health is made."""
 
-    def __init__(self, config: Config, fusion: Fusion, surroundings: Callable[[], Surroundings] = Surroundings) -> None:
-        self._vehicle, self._fusion, self._surroundings = config.vehicle.name, fusion, surroundings
+    def __init__(self, config: Config, fusion: Fusion, io_health: Callable[[], IoHealth] = IoHealth) -> None:
+        self._vehicle, self._fusion, self._io_health = config.vehicle.name, fusion, io_health
         settled = config.publish.settled_hz
         self._settled_ns = SECOND / Fraction(settled).limit_denominator(RATE_DENOMINATOR) if settled else None
         self._next_settled_ns = self._next_health_ns = 0  # from the first event
@@ -104,7 +104,7 @@ class Publication:
 
     def health(self, since_start_ns: int, state: StateMessage) -> HealthMessage:
         """How everything is at the instant of a state."""
-        around = self._surroundings()
+        around = self._io_health()
         return HealthMessage(
             vehicle=self._vehicle,
             t_ns=state.t_ns,

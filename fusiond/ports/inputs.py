@@ -111,7 +111,7 @@ class LiveInput(Protocol[Item]):
 
 
 @dataclass(frozen=True)
-class Receiver:
+class InputContext:
     """What an input works for: the part of the daemon that takes its frames."""
 
     clock: Clock  # stamps the receipts

@@ -118,7 +118,7 @@ class LiveOutput(Protocol):
 
 
 @dataclass(frozen=True)
-class Around:
+class OutputContext:
     """What an output can use besides the configuration."""
 
     clock: Clock  # the time line of all stamps

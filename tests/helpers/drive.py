@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.messages.types import Message
@@ -50,5 +50,5 @@ def messages() -> tuple[Message, ...]:
     """Everything published at 50 Hz: states, settled states, innovations, events, health."""
     told: list[Message] = []
     logs = open_logs([str(folder() / log) for log in LOGS], settings())
-    Replay(settings(), Wants(50.0, on_message=[told.append])).run(logs)
+    Replay(settings(), ReplayTask(50.0, on_message=[told.append])).run(logs)
     return tuple(told)

@@ -143,7 +143,7 @@ def _play(settings: Config, speed: float, *, publish: bool) -> Played:
         dropped=sum(source.inbox.dropped for source in daemon.inputs.values()),
         speed=LENGTH_NS / 1e9 / player.seconds,
         late_ms=player.late_ns / 1e6,
-        overtaken_ms=daemon.live.most_moved_ns / 1e6,
+        overtaken_ms=daemon.live.max_moved_ns / 1e6,
     )
 
 

@@ -26,9 +26,9 @@ from fusiond.config.toml import ConfigError
 from fusiond.filter.stored_state import to_text
 from fusiond.messages import EventMessage, HealthMessage, LatencyHealth, Message, OutputHealth, StateMessage
 from fusiond.messages.info import config_message, info_message
-from fusiond.messages.schedule import Surroundings
-from fusiond.ports.inputs import LiveInput, Receiver
-from fusiond.ports.outputs import Around, LiveOutput
+from fusiond.messages.schedule import IoHealth
+from fusiond.ports.inputs import InputContext, LiveInput
+from fusiond.ports.outputs import LiveOutput, OutputContext
 from fusiond_adapters.host import journal
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.host.systemd import Notifier, watchdog_s
@@ -68,10 +68,10 @@ class Daemon:
         if config.state.file is not None:
             self._state_file = StateFile(config.path(config.state.file), config, self.clock.now_ns())
             stored = self._state_file.stored
-        self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._surroundings, stored=stored)
+        self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._io_health, stored=stored)
         self._wake = Event()  # the estimator: there is something to do
         self.inputs = Inputs(self._make_inputs(config), self._max_pause_s, self.stop)
-        made = make_outputs(config, Around(self.clock, self.inputs)) | {one.name: one for one in outputs}
+        made = make_outputs(config, OutputContext(self.clock, self.inputs)) | {one.name: one for one in outputs}
         if not zenoh:
             del made["zenoh"]
         self.outputs = Outputs(made.values(), self.clock.now_ns, self._introduction, self._max_pause_s)
@@ -127,7 +127,7 @@ class Daemon:
         log.info("ended: %s", self.status(), extra={"MESSAGE_ID": journal.ENDED})
 
     def _make_inputs(self, config: Config) -> dict[str, LiveInput[Any]]:
-        return make_inputs(config, Receiver(self.clock, self._wake.set, self._is_alive))
+        return make_inputs(config, InputContext(self.clock, self._wake.set, self._is_alive))
 
     def _is_alive(self) -> bool:
         return self.estimator.is_alive()
@@ -217,7 +217,7 @@ class Daemon:
         late = "" if latency is None else f", latency p50 {latency.p50:g} ms p99 {latency.p99:g} ms"
         return f"{self._mode or 'no data yet'}, {self.live.offered} measurements, {self.published} published{late}"
 
-    def _surroundings(self) -> Surroundings:
+    def _io_health(self) -> IoHealth:
         """What the health tells of inputs, outputs and latency."""
         outputs = self.outputs.health()
         if box := self._recorder:
@@ -226,7 +226,7 @@ class Daemon:
         if file := self._state_file:
             outputs["state"] = file.health(self.live.engine.fusion.hot_start())
         latency = LatencyHealth(fused=self.live.to_fusion.report(), published=self.outputs.handed_over.report())
-        return Surroundings(latency, self.inputs.health(), outputs)
+        return IoHealth(latency, self.inputs.health(), outputs)
 
     def losses(self) -> dict[str, int]:
         """What was lost so far, by kind; all of it is counted, none of it is silent."""

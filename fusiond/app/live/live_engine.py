@@ -18,7 +18,7 @@ from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages import Message
 from fusiond.messages.latency import RecentLatencies
-from fusiond.messages.schedule import Surroundings
+from fusiond.messages.schedule import IoHealth
 
 MICROSECOND = 1_000  # ns
 MAX_FRAMES = 256  # taken at once
@@ -38,20 +38,20 @@ class Source(Protocol):
 
 class LiveEngine:
     """Engine and inputs of a running daemon. `now` reads the time line; `sink` takes whatever is to go out;
-    `surroundings` tells the health of the shell; `record` takes kind of file, stamp, bytes; `stored` is for a hot start."""
+    `io_health` tells the health of the shell; `record` takes kind of file, stamp, bytes; `stored` is for a hot start."""
 
     def __init__(
         self,
         config: Config,
         now: Callable[[], int],
         sink: Callable[[Message], None],
-        surroundings: Callable[[], Surroundings] = Surroundings,
+        io_health: Callable[[], IoHealth] = IoHealth,
         record: Callable[[str, int, bytes], None] | None = None,
         stored: StoredState | None = None,
     ) -> None:
-        self.engine = Engine(config, sink, surroundings=surroundings, stored=stored)
+        self.engine = Engine(config, sink, io_health=io_health, stored=stored)
         self.record = record
-        self.moved = self.most_moved_ns = 0  # stamps, see above
+        self.moved = self.max_moved_ns = 0  # stamps, see above
         self.offered = 0  # measurements given to the fusion
         self.to_fusion = RecentLatencies()  # from receipt to having been fused
         self._now = now
@@ -80,7 +80,7 @@ class LiveEngine:
             if number == MAX_FRAMES or (give_way and self._tick_before(t_ns)):
                 self._frames = frames[number:]
                 return True
-            self._take(self._ordered(t_ns), source, item)
+            self._feed_frame(self._ordered(t_ns), source, item)
             if give_way and self.engine.unfinished:  # a tick that has waited for this frame
                 self._frames = frames[number + 1 :]
                 return True
@@ -110,12 +110,12 @@ class LiveEngine:
         whole = t_ns // MICROSECOND * MICROSECOND
         if whole <= self._last_ns:
             self.moved += self._last_ns - whole > MOVED_NS
-            self.most_moved_ns = max(self.most_moved_ns, self._last_ns - whole)
+            self.max_moved_ns = max(self.max_moved_ns, self._last_ns - whole)
             whole = self._last_ns + MICROSECOND
         self._last_ns = whole
         return whole
 
-    def _take(self, t_ns: int, source: Source, item: Any) -> None:
+    def _feed_frame(self, t_ns: int, source: Source, item: Any) -> None:
         usable = 0
         for event in source.decode(item, t_ns):
             receipt = self.engine.feed(event)

@@ -19,8 +19,8 @@ from fusiond.engine import Engine
 from fusiond.errors import OutputError
 from fusiond.messages import LatencyHealth, Message
 from fusiond.messages.info import config_message, info_message
-from fusiond.messages.schedule import Surroundings
-from fusiond.ports.outputs import Around, LiveOutput
+from fusiond.messages.schedule import IoHealth
+from fusiond.ports.outputs import LiveOutput, OutputContext
 from fusiond_adapters.registry import make_outputs
 from fusiond_adapters.zenoh.output import ZenohOutput
 
@@ -52,7 +52,7 @@ class Attached:
         made: list[LiveOutput]
         if everything:
             config, self.warnings = attachable(config)
-            made = list(make_outputs(config, Around(clock, {})).values())
+            made = list(make_outputs(config, OutputContext(clock, {})).values())
         else:
             made = [ZenohOutput(config)]
         self.outputs = Outputs(made, clock.now_ns, self._introduction, self._max_pause_s, PATIENCE_S)
@@ -66,10 +66,10 @@ class Attached:
         """Leave a message with every output: an engine's sink."""
         self.outputs.put(message)
 
-    def surroundings(self) -> Surroundings:
+    def io_health(self) -> IoHealth:
         """What the health says of the outputs; latencies where there is a pace to keep."""
         latency = LatencyHealth(published=self.outputs.handed_over.report() if self._paced else None)
-        return Surroundings(latency, {}, self.outputs.health())
+        return IoHealth(latency, {}, self.outputs.health())
 
     @contextmanager
     def opened(self, engine: Engine) -> Iterator[None]:

@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 BLUE, VERMILION, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#808080"
 STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.titlesize": 10}
 SIZE, DPI = (13.0, 6.8), 110  # inches, dots per inch
-LARGEST_AXIS_SIGMAS = 4.0  # how far an error axis reaches, in median sigmas, at the least
+MIN_AXIS_SIGMAS = 4.0  # how far an error axis reaches, in median sigmas, at the least
 CLOSE_UP_M = 25.0  # half the width of the close-up
-MOST_MARKS = 400  # rejected fixes marked one by one on the error axes
+MAX_MARKS = 400  # rejected fixes marked one by one on the error axes
 
 
 def draw(trace: Trace, summary: Summary, path: Path) -> None:
@@ -120,7 +120,7 @@ def _errors(axes: Sequence[Axes], ticks: Sequence[TickSample], rejected: Sequenc
         ax.set_ylabel(label)
         for stretch in summary.dead_reckoning.stretches if summary.dead_reckoning else ():
             ax.axvspan(stretch.start_s, stretch.stop_s, color=GREEN, alpha=0.15, linewidth=0)
-        for fix in rejected[:MOST_MARKS]:
+        for fix in rejected[:MAX_MARKS]:
             ax.axvline((fix.t_ns - first_ns) / 1e9, color=VERMILION, alpha=0.25, linewidth=1.0)
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
@@ -138,7 +138,7 @@ def _band(ax: Axes, second: Array, values: Array, sigmas: Array) -> None:
     ax.grid(alpha=0.25)
     if len(sigmas):
         # the first moments, when little is known yet, must not flatten all the rest
-        typical = max(float(np.quantile(2 * sigmas, 0.98)), LARGEST_AXIS_SIGMAS * float(np.median(sigmas)))
+        typical = max(float(np.quantile(2 * sigmas, 0.98)), MIN_AXIS_SIGMAS * float(np.median(sigmas)))
         seen = np.abs(values[np.isfinite(values)])
         reach = 1.15 * max(typical, float(np.quantile(seen, 0.99)) if len(seen) else 0.0)
         if reach > 0:

@@ -28,7 +28,7 @@ from fusiond.events import ClockPair, Received
 from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages import Message, StateMessage
-from fusiond.messages.schedule import Surroundings
+from fusiond.messages.schedule import IoHealth
 
 WHOLE = Window()
 
@@ -39,7 +39,7 @@ Pace = Callable[[int], None]
 
 
 @dataclass
-class Wants:
+class ReplayTask:
     """What a replay is to do besides fusing. Without a tick sink there are no ticks."""
 
     rate_hz: float
@@ -51,38 +51,38 @@ class Wants:
     on_message: list[MessageSink] = field(default_factory=list)  # everything that a live run would publish
     window: Window = WHOLE  # of the comparison with the truth
     stored: StoredState | None = None  # that the run began with
-    surroundings: Callable[[], Surroundings] = Surroundings  # what the health says of attached outputs
+    io_health: Callable[[], IoHealth] = IoHealth  # what the health says of attached outputs
 
 
 class Replay:
     """One run of recorded events through an engine."""
 
-    def __init__(self, config: Config, wants: Wants) -> None:
+    def __init__(self, config: Config, task: ReplayTask) -> None:
         self.config = config
         self.events = self.clock_pairs = 0
-        self._wants = wants
-        self._ticking = bool(wants.on_tick or wants.on_message) or wants.truth is not None
+        self._task = task
+        self._ticking = bool(task.on_tick or task.on_message) or task.truth is not None
         self.engine = Engine(
             config,
-            self._take_message if self._ticking else None,
-            rate_hz=wants.rate_hz,
-            only_states=not wants.on_message,
-            surroundings=wants.surroundings,
-            pace=wants.pace,
-            stored=wants.stored,
+            self._handle if self._ticking else None,
+            rate_hz=task.rate_hz,
+            only_states=not task.on_message,
+            io_health=task.io_health,
+            pace=task.pace,
+            stored=task.stored,
         )
         self.fusion = self.engine.fusion
         self._withheld: Counter[str] = Counter()
         self._modes: Counter[str] = Counter()
         self._latencies = {source: Latencies() for source in config.sources()}
-        self._comparison = Comparison(wants.window)
+        self._comparison = Comparison(task.window)
         self._reckoning = DeadReckoningLog(config.filter.position_timeout_s)
 
     def run(self, events: Iterable[Received]) -> None:
         """Take all events, in order of receipt."""
         for event in events:
             self.events += 1
-            if self._wants.withheld and self._is_withheld(event):
+            if self._task.withheld and self._is_withheld(event):
                 self._withheld[event.source] += 1
                 self.engine.advance(event.t_receive_ns)
             else:
@@ -103,7 +103,7 @@ class Replay:
         first_ns = event.t_receive_ns if self.first_ns is None else self.first_ns
         since_ns = max(event.t_receive_ns, self.engine.now_ns) - first_ns
         return any(
-            event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._wants.withheld
+            event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._task.withheld
         )
 
     def _note(self, event: Received, receipt: Receipt | None) -> None:
@@ -113,24 +113,24 @@ class Replay:
         if receipt.refusal is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)
-        for sink in self._wants.on_receipt:
+        for sink in self._task.on_receipt:
             sink(receipt)
 
-    def _take_message(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         if isinstance(message, StateMessage):
-            self._take_state(message)
-        for sink in self._wants.on_message:
+            self._add_state(message)
+        for sink in self._task.on_message:
             sink(message)
 
-    def _take_state(self, state: StateMessage) -> None:
+    def _add_state(self, state: StateMessage) -> None:
         assert self.first_ns is not None
         since_start_ns = state.t_ns - self.first_ns
-        errors = errors_of(state, self._wants.truth.at(state.t_ns)) if self._wants.truth else None
+        errors = errors_of(state, self._task.truth.at(state.t_ns)) if self._task.truth else None
         self._modes[state.mode.value] += 1
         self._reckoning.add(since_start_ns, state, errors)
         if errors:
             self._comparison.add(since_start_ns, errors)
-        for sink in self._wants.on_tick:
+        for sink in self._task.on_tick:
             sink(state, errors)
 
     def summary(self, config_name: str, logs: dict[str, dict[str, int]], warnings: list[str]) -> Summary:
@@ -140,7 +140,7 @@ class Replay:
         published = None
         if self._ticking:
             modes = dict(self._modes)
-            published = Publications(rate_hz=self._wants.rate_hz, rows=engine.ticks, skipped=engine.skipped, modes=modes)
+            published = Publications(rate_hz=self._task.rate_hz, rows=engine.ticks, skipped=engine.skipped, modes=modes)
         return Summary(
             fusiond=__version__,
             config=config_name,

@@ -16,8 +16,8 @@ from fusiond.messages.types import StateMessage
 from fusiond.timeline.clock import ClockReport
 
 LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # bins of the latency histograms and where they end
-LATENCIES_AT_ONCE = 1024
-LISTED_STRETCHES = 50  # stretches of dead reckoning that are told one by one
+BATCH = 1024
+MAX_STRETCHES = 50  # stretches of dead reckoning that are told one by one
 
 
 class Latency(Struct, frozen=True, kw_only=True):
@@ -119,7 +119,7 @@ class Latencies:
     def add(self, latency_ns: int) -> None:
         new = self._new
         new.append(latency_ns)
-        if len(new) == LATENCIES_AT_ONCE:
+        if len(new) == BATCH:
             self._gather()
 
     def _gather(self) -> None:
@@ -175,7 +175,7 @@ class DeadReckoningLog:
         _, stop_m, sigma, error = self._last
         self._count += 1
         self._seconds += stop_s - start_s
-        if len(self._stretches) < LISTED_STRETCHES:
+        if len(self._stretches) < MAX_STRETCHES:
             stretch = Stretch(start_s=start_s, stop_s=stop_s, distance_m=stop_m - start_m, sigma_m=sigma, error_m=error)
             self._stretches.append(stretch)
         self._begun = self._last = None

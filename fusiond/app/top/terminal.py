@@ -19,7 +19,7 @@ from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMe
 from fusiond.ports.outputs import Outbox
 
 SHOWN: tuple[type[Message], ...] = (StateMessage, HealthMessage, EventMessage)
-MOST_WAITING = 1024
+MAX_WAITING = 1024
 REDRAW_S = 0.25
 FIRST_S = 5.0  # how long `once` waits for a state and a health
 CODES: dict[Colour, str] = {"plain": "0", "dim": "2", "bold": "1", "green": "32", "yellow": "33", "red": "1;31"}
@@ -34,14 +34,14 @@ class Watch:
     def __init__(self, client: Client, clock: Callable[[], float] = time.monotonic) -> None:
         self.view = View()
         self._client, self._clock = client, clock
-        self._outbox = Outbox(MOST_WAITING, SHOWN)
+        self._outbox = Outbox(MAX_WAITING, SHOWN)
         self._stack = ExitStack()
         self._last = clock()
 
     def look(self, timeout_s: float) -> None:
         """Take in what has come; waits for it up to `timeout_s`."""
         for message in self._outbox.take(timeout_s):
-            self.view.take(message)
+            self.view.add(message)
             if isinstance(message, StateMessage):
                 self._last = self._clock()
 

@@ -59,7 +59,7 @@ class View:
         self.events: deque[EventMessage] = deque(maxlen=EVENTS)
         self._stamps: deque[int] = deque(maxlen=STATES)
 
-    def take(self, message: Message) -> None:
+    def add(self, message: Message) -> None:
         """Take in a message of any kind."""
         if isinstance(message, StateMessage):
             self.state = message

@@ -156,11 +156,11 @@ def test_a_late_joiner_gets_the_last_at_once_and_a_stream_only_what_comes() -> N
         got: list[StateMessage] = []
         came = Event()
 
-        def take(message: StateMessage) -> None:
+        def receive(message: StateMessage) -> None:
             got.append(message)
             came.set()
 
-        with first.subscribed(StateMessage, take):
+        with first.subscribed(StateMessage, receive):
             for _ in range(100):  # until the subscription has reached the publisher
                 output.outbox.put(told[2])
                 if came.wait(0.1):

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.messages.codec import encode
@@ -301,8 +301,8 @@ def test_reload(tmp_path: Path) -> None:
 def replayed(settings: Config, logs: list[str]) -> list[bytes]:
     """What a replay of recordings publishes."""
     told: list[bytes] = []
-    wants = Wants(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])
-    Replay(settings, wants).run(open_logs(logs, settings))
+    task = ReplayTask(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])
+    Replay(settings, task).run(open_logs(logs, settings))
     return told
 
 

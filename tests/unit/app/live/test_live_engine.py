@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common
 
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.live.live_engine import MAX_FRAMES, LiveEngine
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
 from fusiond.events import Received
@@ -212,7 +212,7 @@ def live_messages(setup: Config, events: list[Received], *, give_way: bool, batc
 
 def replayed_messages(setup: Config, events: list[Received]) -> list[Message]:
     said: list[Message] = []
-    Replay(setup, Wants(setup.publish.rate_hz, on_message=[said.append])).run(events)
+    Replay(setup, ReplayTask(setup.publish.rate_hz, on_message=[said.append])).run(events)
     return said
 
 

@@ -221,7 +221,7 @@ def test_many_stretches_are_counted_but_not_all_kept() -> None:
         log.add(second * SECOND, message(second, Mode.DEAD_RECKONING if second % 2 else Mode.NOMINAL), None)
     found = log.report()
     assert found.count == 200
-    assert len(found.stretches) == report.LISTED_STRETCHES
+    assert len(found.stretches) == report.MAX_STRETCHES
 
 
 def test_source_report_adds_up() -> None:

@@ -33,7 +33,7 @@ CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 def view_of(*told: Message) -> View:
     view = View()
     for message in told:
-        view.take(message)
+        view.add(message)
     return view
 
 
