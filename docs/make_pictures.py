@@ -20,10 +20,11 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from fusiond.app.demo import demo
-from fusiond.app.replay.comparison import Truth, Window, displacement, parse_truth
+from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.summary import Summary
+from fusiond.app.replay.truth import Truth, displacement, parse_truth
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config
 from fusiond.estimator.fusion import state_estimate

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 
-from fusiond.app import mounting
+from fusiond.app.mounting.report import text
+from fusiond.app.mounting.rotation import find
+from fusiond.app.mounting.windows import Gathering
 from fusiond.app.progress import shown
 from fusiond.config import load as config
 from fusiond.timeline.clock import Clock
@@ -27,11 +29,11 @@ def fill(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """The action."""
     loaded = config.load(arguments.config)
-    ((source, imu),) = loaded.imu.items()
-    logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), mounting.Gathering(loaded)
+    ((name, imu),) = loaded.imu.items()
+    logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), Gathering(loaded)
     progress = shown(logs, lambda: logs.bytes_read / logs.bytes_total, lambda: gathering.elapsed_ns, sys.stderr)
     for received in progress:
         measurement = clock.align(received)
         if measurement is not None:
             gathering.add(measurement)
-    print(mounting.text(mounting.find(gathering.windows(), imu.rotation_deg), source))
+    print(text(find(gathering.windows(), imu.rotation_deg), name))

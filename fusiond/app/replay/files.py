@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from fusiond.app.replay.comparison import Errors, Truth, TruthError, TruthRow, parse_truth
+from fusiond.app.replay.comparison import Errors
+from fusiond.app.replay.truth import Truth, TruthError, TruthSample, parse_truth
 from fusiond.app.state_file import read_state
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
@@ -39,7 +40,7 @@ def truth_of(path: Path) -> Truth:
     return Truth(_read_truth(path))
 
 
-def _read_truth(path: Path) -> Iterator[TruthRow]:
+def _read_truth(path: Path) -> Iterator[TruthSample]:
     opener = gzip.open if path.suffix.lower() == ".gz" else open
     try:
         with opener(path, "rt", encoding="utf-8") as file:

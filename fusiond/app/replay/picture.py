@@ -15,9 +15,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from fusiond.app.replay.comparison import wrapped
 from fusiond.app.replay.summary import Summary
 from fusiond.app.replay.trace import FixSample, TickSample, Trace
+from fusiond.app.replay.truth import wrapped
 
 Array = NDArray[np.float64]
 

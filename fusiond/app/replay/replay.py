@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from fusiond import __version__
-from fusiond.app.replay.comparison import Comparison, Errors, Truth, Window, errors_of
+from fusiond.app.replay.comparison import Comparison, Errors, Window, errors_of
 from fusiond.app.replay.intervals import Withheld
 from fusiond.app.replay.summary import (
     DeadReckoningLog,
@@ -21,6 +21,7 @@ from fusiond.app.replay.summary import (
     Summary,
     source_report,
 )
+from fusiond.app.replay.truth import Truth
 from fusiond.config.schema import Config
 from fusiond.engine import SECOND, Engine
 from fusiond.estimator.fusion import Receipt

@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 import msgspec
 from msgspec import Struct
 
-from fusiond.app.replay.comparison import Errors, Histogram, TruthReport
+from fusiond.app.replay.comparison import Errors, TruthReport
+from fusiond.app.replay.statistics import Histogram
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
 from fusiond.timeline.clock import ClockReport
@@ -134,7 +135,7 @@ class Latencies:
         if not histogram.count:
             return None
         p50, p90, p99 = (round(histogram.quantile(share), 2) for share in (0.5, 0.9, 0.99))
-        return Latency(min=histogram.least, p50=p50, p90=p90, p99=p99, max=histogram.greatest)
+        return Latency(min=histogram.minimum, p50=p50, p90=p90, p99=p99, max=histogram.maximum)
 
 
 class DeadReckoningLog:

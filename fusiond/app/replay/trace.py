@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Generic, NamedTuple, TypeVar
 
-from fusiond.app.replay.comparison import Errors, displacement
+from fusiond.app.replay.comparison import Errors
+from fusiond.app.replay.truth import displacement
 from fusiond.estimator.fusion import Receipt
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssPosition

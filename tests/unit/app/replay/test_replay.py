@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from fusiond.app.replay.comparison import Errors, Truth, TruthRow, Window
+from fusiond.app.replay.comparison import Errors, Window
 from fusiond.app.replay.intervals import Withheld, parse_withheld
 from fusiond.app.replay.replay import Replay, ReplayTask
+from fusiond.app.replay.truth import Truth, TruthSample
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
@@ -255,7 +256,7 @@ def test_latency_counts_the_configured_delay(setup: Config) -> None:
 
 def test_window_limits_the_comparison(setup: Config, events: list[Received]) -> None:
     first = events[0].t_receive_ns
-    rows = [TruthRow(first + k * SECOND // 10, 48.137, 11.575, 560.0, 9.0, 0.0, 0.0) for k in range(60)]
+    rows = [TruthSample(first + k * SECOND // 10, 48.137, 11.575, 560.0, 9.0, 0.0, 0.0) for k in range(60)]
     replay = Replay(setup, ReplayTask(10.0, truth=Truth(rows), window=Window(3.0, 5.0)))
     replay.run(events)
     found = replay.summary("c.toml", {}, []).truth
