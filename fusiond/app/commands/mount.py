@@ -1,4 +1,4 @@
-"""fusiond mount: how the IMU is turned in the vehicle."""
+"""fusiond mount: the mounting angles of the IMU."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from fusiond.timeline.clock import Clock
 from fusiond_adapters.logs.merge import open_logs
 
 ABOUT = """\
-Find how the IMU is turned against forward-right-down, from the logs of a drive, and print the rotation_deg to configure:
-any rotation, upside down included. Run again with that configured, it tells what is left. The drive needs a minute or
-more, mostly forward, with pulling away, braking, and bends both ways. The configuration is not changed."""
+Estimate the rotation of the IMU against forward-right-down from the logs of a drive, and print the rotation_deg to
+configure: any rotation, upside down included. With that configured, a second run shows the remaining rotation. The drive
+needs a minute or more, mostly forward, with pulling away, braking, and bends both ways. The configuration is not changed."""
 
 
 def fill(parser: argparse.ArgumentParser) -> None:
-    """The grammar."""
+    """Define the arguments."""
     parser.description, parser.epilog = ABOUT, "example:\n  fusiond mount --config car.toml drive.tlog drive.log"
     parser.add_argument("logs", metavar="LOG", nargs="+", help="as for replay")
     parser.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """The action."""
+    """Run the command."""
     loaded = config.load(arguments.config)
     ((name, imu),) = loaded.imu.items()
     logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), Gathering(loaded)

@@ -1,4 +1,4 @@
-"""One `fusiond replay`: the logs and files that it reads, the files and outputs that it feeds, around a replay."""
+"""One `fusiond replay`: a replay with its logs, files and outputs."""
 
 from __future__ import annotations
 
@@ -52,19 +52,19 @@ class Options:
     rate_hz: float | None = None  # default: the configuration's
     speed: float | None = None  # default: as fast as possible
     publish: bool = False  # over Zenoh
-    outputs: bool = False  # over everything that the configuration turns on
+    outputs: bool = False  # to every output that the configuration turns on
     share: Callable[[int], float] | None = None  # part done by the time passed [ns], for the bar; default: bytes read
 
 
 def replay(options: Options) -> Summary:
-    """Replay logs as asked for, and write what was asked for.
+    """Replay logs, and write the requested files.
 
     Raises ConfigError, LogError, TruthError, UsageError, OutputError.
     """
     config, logs = options.config, open_logs(options.logs, options.config)
     pacer = Pacer(options.speed) if options.speed else None
     task = ReplayTask(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)
-    task.stored = stored_state(options.stored, config) if options.stored else None
+    task.stored_state = stored_state(options.stored, config) if options.stored else None
     task.truth = truth_of(options.truth) if options.truth else None
     trace = Trace() if options.plot else None
     if trace:
@@ -100,10 +100,10 @@ def replay(options: Options) -> Summary:
 
 
 def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
-    """Open what every tick goes to; what cannot be written is found before the work begins."""
-    written = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
-    read = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
-    check_outputs(written, read)
+    """Open the files of the ticks. A file that cannot be written is detected before the work begins."""
+    outputs = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
+    inputs = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
+    check_outputs(outputs, inputs)
     if options.plot and importlib.util.find_spec("matplotlib") is None:
         raise UsageError("--plot needs the extra plot: pip install 'fusiond[plot]'")
     if options.csv:
@@ -113,11 +113,11 @@ def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
 
 
 def _summary(options: Options, run: Replay, logs: LogSet, attached_warnings: Sequence[str]) -> Summary:
-    """What came out. Raises LogError where nothing went in."""
+    """The summary. Raises LogError if no event was read."""
     names = short_names(logs.counts)
     if run.first_ns is None:
-        met = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())
-        raise LogError(f"nothing in the logs that the configuration asks for ({met})")
+        found = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())
+        raise LogError(f"nothing in the logs that the configuration asks for ({found})")
     warnings = [with_short_names(warning, names) for warning in logs.warnings]
     summary = run.summary(options.config_name, {names[path]: counts for path, counts in logs.counts.items()}, warnings)
     if options.stored and (verdict := run.fusion.hot_start()) is not Verdict.BELIEVED:

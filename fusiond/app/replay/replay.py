@@ -1,6 +1,6 @@
-"""Replay: recorded events through the engine in their order of receipt, and what is made of its messages.
+"""Replay: recorded events go through the engine in their order of receipt; its messages to files, statistics, outputs.
 
-A tick is a publication, see `fusiond.engine`: it tells what the live daemon told at that instant.
+A tick is a publication, see `fusiond.engine`: it has the messages that the live daemon published at that instant.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from fusiond.app.replay.summary import (
 )
 from fusiond.app.replay.truth import Truth
 from fusiond.config.schema import Config
-from fusiond.engine import SECOND, Engine
+from fusiond.engine import Engine
 from fusiond.estimator.fusion import Receipt
 from fusiond.events import ClockPair, Received
 from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages import Message, StateMessage
 from fusiond.messages.schedule import IoHealth
+from fusiond.units import SECOND
 
 WHOLE = Window()
 
@@ -41,18 +42,18 @@ Pace = Callable[[int], None]
 
 @dataclass
 class ReplayTask:
-    """What a replay is to do besides fusing. Without a tick sink there are no ticks."""
+    """What a replay does besides fusing. Without a sink for ticks or messages there are no ticks."""
 
     rate_hz: float
     withheld: Sequence[Withheld] = ()
     truth: Truth | None = None
-    pace: Pace | None = None  # called with the time of what comes next [ns from the first event]; may sleep
+    pace: Pace | None = None  # called with the time of the next event or tick [ns from the first event]; may sleep
     on_tick: list[TickSink] = field(default_factory=list)
     on_receipt: list[ReceiptSink] = field(default_factory=list)
     on_message: list[MessageSink] = field(default_factory=list)  # everything that a live run would publish
     window: Window = WHOLE  # of the comparison with the truth
-    stored: StoredState | None = None  # that the run began with
-    io_health: Callable[[], IoHealth] = IoHealth  # what the health says of attached outputs
+    stored_state: StoredState | None = None  # that the run started with
+    io_health: Callable[[], IoHealth] = IoHealth  # health of the attached outputs
 
 
 class Replay:
@@ -65,12 +66,12 @@ class Replay:
         self._ticking = bool(task.on_tick or task.on_message) or task.truth is not None
         self.engine = Engine(
             config,
-            self._handle if self._ticking else None,
+            self._receive if self._ticking else None,
             rate_hz=task.rate_hz,
             only_states=not task.on_message,
             io_health=task.io_health,
             pace=task.pace,
-            stored=task.stored,
+            stored_state=task.stored_state,
         )
         self.fusion = self.engine.fusion
         self._withheld: Counter[str] = Counter()
@@ -80,14 +81,14 @@ class Replay:
         self._reckoning = DeadReckoningLog(config.filter.position_timeout_s)
 
     def run(self, events: Iterable[Received]) -> None:
-        """Take all events, in order of receipt."""
+        """Feed all events, in order of receipt."""
         for event in events:
             self.events += 1
             if self._task.withheld and self._is_withheld(event):
                 self._withheld[event.source] += 1
                 self.engine.advance(event.t_receive_ns)
             else:
-                self._note(event, self.engine.feed(event))
+                self._count(event, self.engine.feed(event))
         self.engine.finish()
 
     @property
@@ -97,7 +98,7 @@ class Replay:
 
     @property
     def elapsed_ns(self) -> int:
-        """How much of the drive has passed."""
+        """Time from the first receipt to the latest."""
         return self.engine.elapsed_ns
 
     def _is_withheld(self, event: Received) -> bool:
@@ -107,7 +108,7 @@ class Replay:
             event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._task.withheld
         )
 
-    def _note(self, event: Received, receipt: Receipt | None) -> None:
+    def _count(self, event: Received, receipt: Receipt | None) -> None:
         if receipt is None:
             self.clock_pairs += isinstance(event.payload, ClockPair)
             return
@@ -117,7 +118,7 @@ class Replay:
         for sink in self._task.on_receipt:
             sink(receipt)
 
-    def _handle(self, message: Message) -> None:
+    def _receive(self, message: Message) -> None:
         if isinstance(message, StateMessage):
             self._add_state(message)
         for sink in self._task.on_message:
@@ -135,7 +136,7 @@ class Replay:
             sink(state, errors)
 
     def summary(self, config_name: str, logs: dict[str, dict[str, int]], warnings: list[str]) -> Summary:
-        """What came out. There must have been an event."""
+        """The summary. There must have been an event."""
         engine = self.engine
         assert engine.first_ns is not None
         published = None

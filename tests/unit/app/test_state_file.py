@@ -116,7 +116,7 @@ def replayed(setup: Config, logs: list[Path], stored: StoredState | None) -> lis
     def keep(message: StateMessage, _: object) -> None:
         published.append(encode(message, "json"))
 
-    task = ReplayTask(setup.publish.rate_hz, on_tick=[keep], stored=stored)
+    task = ReplayTask(setup.publish.rate_hz, on_tick=[keep], stored_state=stored)
     Replay(setup, task).run(open_logs([str(path) for path in logs], setup))
     return published
 

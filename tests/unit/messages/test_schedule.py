@@ -46,7 +46,7 @@ def test_a_reset_is_published_with_its_reason(tmp_path: Path) -> None:
     player = Player(settings)
     player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
     messages = player.told
-    why = "gps0.position was rejected too long with a constant error; the state was set to it"
+    why = "gps0.position: rejected with a constant error for too long; the state was set to it"
     events = [message for message in messages if isinstance(message, EventMessage)]
     assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
     assert [message.subject for message in events if message.kind == "mode"] == [

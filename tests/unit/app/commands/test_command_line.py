@@ -100,7 +100,7 @@ def test_replay_writes_track_summary_and_text(replay: Run, folder: Path, tmp_pat
     assert summary.truth.position.rmse_m < 3.0
     assert summary.truth.heading.rmse_deg < 3.0
     assert list(summary.logs) == ["drive.tlog", "drive.log"]
-    for part in ("tested: 8.1 s", "gps0.position", "final state", "against the truth, seconds 2.0 to"):
+    for part in ("tested: 8.1 s", "gps0.position", "final state", "compared with the truth, seconds 2.0 to"):
         assert part in out
 
 
@@ -126,7 +126,7 @@ def test_gzipped_logs_and_truth_give_the_same_track(replay: Run, folder: Path, t
     code, packed_text, _ = replay(*zipped, "--csv", packed, "--truth", tmp_path / "truth.csv.gz")
     assert code == SUCCESS
     assert plain.read_bytes() == packed.read_bytes()
-    assert plain_text.split("against the truth")[1] == packed_text.split("against the truth")[1]
+    assert plain_text.split("compared with the truth")[1] == packed_text.split("compared with the truth")[1]
 
 
 def test_rate_and_withheld_sources(replay: Run, tmp_path: Path) -> None:
@@ -247,7 +247,7 @@ def test_help_and_version(run: Run) -> None:
     ("arguments", "complaint"),
     [
         (["--withhold", "gps9:1-2"], "there is no source 'gps9'; configured: gps0"),
-        (["--withhold", "gps0:2-1"], "is no interval"),
+        (["--withhold", "gps0:2-1"], "is not an interval"),
         (["--window", "1-2"], "give --truth as well"),
         (["--rate", "0"], "between 0.001 and 1000 Hz"),
         (["--rate", "fast"], "'fast' is not a number"),
@@ -305,7 +305,7 @@ def test_bad_truth(replay: Run, folder: Path, tmp_path: Path) -> None:
     assert "is not UTF-8 text" in replay("--truth", bad)[2]
     zipped = tmp_path / "bad.csv.gz"
     zipped.write_bytes(gzip.compress((folder / "truth.csv").read_bytes())[:-300])
-    assert "is no sound gzip file" in replay("--truth", zipped)[2]
+    assert "is not a valid gzip file" in replay("--truth", zipped)[2]
     assert "cannot be read" in replay("--truth", tmp_path / "absent.csv")[2]
 
 
