@@ -23,7 +23,7 @@ from fusiond import __version__
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.messages.info import config_table
-from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond.units import SECOND
 from fusiond_adapters.foxglove.converter import SHOWN, Channel, Converter, Record, channels
 from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, file_name, make_room, name_pattern
@@ -242,7 +242,7 @@ class McapRecorder:
             self.lost += file.unknown
 
 
-def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
     """The output of a configuration with a folder for it."""
     assert config.mcap.folder is not None
     return [McapRecorder(config, config.path(config.mcap.folder))]

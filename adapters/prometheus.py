@@ -13,7 +13,7 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import HealthMessage, InnovationMessage, OutcomeCounts, Quantiles, SourceHealth, StateMessage
-from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond.units import SECOND
 
 try:
@@ -66,7 +66,7 @@ class PrometheusServer:
             while not stopping:
                 stopping = stop.is_set()  # before the last look, so that it misses nothing
                 for message in self.outbox.take(POLL_S):
-                    self._take(message)
+                    self._record(message)
         finally:
             self.url = None
             server.shutdown()
@@ -81,7 +81,7 @@ class PrometheusServer:
         """Where to scrape."""
         return {"url": self.url} if self.url else {}
 
-    def _take(self, message: object) -> None:
+    def _record(self, message: object) -> None:
         if isinstance(message, StateMessage):
             self._latest.state = message
         elif isinstance(message, HealthMessage):
@@ -92,7 +92,7 @@ class PrometheusServer:
                 self._ratios.labels(message.source).observe(message.test_ratio)
 
 
-def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
     """The output of a configuration."""
     return [PrometheusServer(config)]
 

@@ -12,8 +12,8 @@ from importlib import import_module
 from typing import Any
 
 from fusiond.config.schema import Config
-from fusiond.ports.inputs import LiveInput, Receiver
-from fusiond.ports.outputs import Around, LiveOutput
+from fusiond.ports.inputs import InputContext, LiveInput
+from fusiond.ports.outputs import LiveOutput, OutputContext
 from fusiond_adapters.logs.format import LogFormat
 
 INPUTS: Mapping[str, str] = {  # section of the configuration: module
@@ -45,22 +45,22 @@ def _mavlink_outputs(config: Config) -> set[str | None]:
     return {config.autopilot.link, config.ground_station.link, config.ground_station.connection}
 
 
-def make_inputs(config: Config, receiver: Receiver) -> dict[str, LiveInput[Any]]:
+def make_inputs(config: Config, context: InputContext) -> dict[str, LiveInput[Any]]:
     """The inputs of a configuration, by section and name, such as mavlink.fc. Raises ConfigError."""
     made: dict[str, LiveInput[Any]] = {}
     for section, module in INPUTS.items():
         if getattr(config, section):
-            inputs: Sequence[LiveInput[Any]] = _make(module, config, receiver)
+            inputs: Sequence[LiveInput[Any]] = _make(module, config, context)
             made |= {f"{section}.{one.name}": one for one in inputs}
     return made
 
 
-def make_outputs(config: Config, around: Around) -> dict[str, LiveOutput]:
+def make_outputs(config: Config, context: OutputContext) -> dict[str, LiveOutput]:
     """The outputs of a configuration, by name. Raises ConfigError, also where an extra is missing."""
     made: dict[str, LiveOutput] = {}
     for module, wanted in OUTPUTS.items():
         if wanted(config):
-            outputs: Sequence[LiveOutput] = _make(module, config, around)
+            outputs: Sequence[LiveOutput] = _make(module, config, context)
             made |= {one.name: one for one in outputs}
     return made
 

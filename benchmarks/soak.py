@@ -27,7 +27,7 @@ import msgspec
 
 from benchmarks.latency import CAN_HZ, IMU_HZ, configuration, free_port, process, sent_by_autopilot, turn_wheels
 from fusiond.app.live.daemon import Daemon
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config.schema import Config
 from fusiond.messages.codec import encode
 from fusiond.messages.types import StateMessage
@@ -153,7 +153,7 @@ def replayed(settings: Config, box: Path, digests: Path) -> tuple[int, int]:
             other += file.read(DIGEST) != digest(message)
 
         logs = [str(path) for path in sorted(box.iterdir())]
-        Replay(settings, Wants(settings.publish.rate_hz, on_tick=[compare])).run(open_logs(logs, settings))
+        Replay(settings, ReplayTask(settings.publish.rate_hz, on_tick=[compare])).run(open_logs(logs, settings))
     return count, other
 
 

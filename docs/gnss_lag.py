@@ -1,4 +1,4 @@
-"""Estimate how much GNSS speed lags behind wheel speed: python gnss_lag.py car.toml drive.tlog drive.log"""
+"""Solution how much GNSS speed lags behind wheel speed: python gnss_lag.py car.toml drive.tlog drive.log"""
 
 import sys
 

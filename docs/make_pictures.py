@@ -20,10 +20,11 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from fusiond.app.demo import demo
-from fusiond.app.replay.comparison import Truth, Window, displacement, parse_truth
+from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.job import Options, replay
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.summary import Summary
+from fusiond.app.replay.truth import Truth, displacement, parse_truth
 from fusiond.app.top.view import View, screen
 from fusiond.config import load as config
 from fusiond.estimator.fusion import solution_state
@@ -248,7 +249,7 @@ def seen(scenario: str, look: Callable[[Replay, StateMessage], tuple[float, ...]
             second.append(run.elapsed_ns / SECOND)
             looks.append(look(run, message))
 
-        run = Replay(settings, Wants(50.0, on_tick=[take]))
+        run = Replay(settings, ReplayTask(50.0, on_tick=[take]))
         run.run(open_logs([str(folder / "drive.tlog"), str(folder / "drive.log")], settings))
         with (folder / "truth.csv").open() as file:
             rows = list(csv.DictReader(file))
@@ -339,10 +340,10 @@ def draw_top() -> None:
         if isinstance(message, StateMessage):
             until_ns[:] = until_ns or [message.t_ns + nanoseconds(TOP_SECOND)]
         if isinstance(message, StateMessage | HealthMessage | EventMessage) and message.t_ns <= until_ns[0]:
-            view.take(message)
+            view.add(message)
 
     logs = open_logs([str(demo.DRIVE / log) for log in demo.LOGS], settings)
-    Replay(settings, Wants(50.0, on_message=[take])).run(logs)
+    Replay(settings, ReplayTask(50.0, on_message=[take])).run(logs)
     lines = screen(view, 0.0, TOP_COLUMNS, 30)
     picture = Image.new("RGB", (TOP_COLUMNS * COLUMN + 2 * MARGIN, len(lines) * ROW + 2 * MARGIN), "#101418")
     folder = Path(get_data_path(), "fonts", "ttf")

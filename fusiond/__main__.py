@@ -1,4 +1,4 @@
-"""The command line: hands it to the command that is called, and turns errors into exit codes."""
+"""The command line: runs one command, and turns errors into exit codes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """The command line's grammar: of the command that is called all of it, of the others their names alone."""
+    """The grammar of the command line: complete for `command`, names only for the others."""
     top = argparse.ArgumentParser(
         prog="fusiond",
-        description="Fuse a vehicle's IMU, GNSS (MAVLink) and wheel speeds (CAN) into one state that knows its errors.",
+        description="Fuse a vehicle's IMU, GNSS (MAVLink) and wheel speeds (CAN) into one state with its covariance.",
         epilog=f"Try `fusiond demo` first. {EXIT_CODES}",
     )
     top.add_argument("--version", action="version", version=f"fusiond {__version__}")
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(str(error), USAGE)
     except UnusableError as error:
         return _failed(str(error), UNUSABLE)
-    except BrokenPipeError:  # whoever read our output has gone; keep the interpreter from flushing into it
+    except BrokenPipeError:  # the reader of our output has gone; keep the interpreter from flushing into it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNUSABLE
     except OSError as error:

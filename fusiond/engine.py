@@ -1,14 +1,14 @@
 """The engine: the only way of an event through clock, fusion and publication. Live and replay call the same `feed`.
 
-Whoever drives the engine gives it events in order of receipt; live, `elapse` also lets time pass where no event comes.
-All that is to be published is handed to one sink, in order.
+The caller gives the engine events in order of receipt; live, it also calls `elapse` while no event comes. All messages to
+publish are handed to one sink, in order.
 
-Tick k stands k periods after the receipt of the first event. It is made after all events received up to it and before
-any received later, so what it tells depends on the events and their receive stamps alone. With `publish.on_imu` it waits
-for the first inertial sample from then on, for half a period at the most, and stands at its receipt: its state is as new
-as that sample. A tick has two steps: its state goes to the sink at once; the rest goes with `flush`, or by itself before
-anything else is done. So a live run can let the state reach its readers before the work on the rest begins, and the
-messages are the same whether it does or not.
+Tick k is k periods after the receipt of the first event. It is made after all events received up to it and before any
+received later, so its messages depend only on the events and their receive stamps. With `publish.on_imu` a tick waits for
+the next inertial sample, for half a period at most, and is made at its receipt: its state is as new as that sample. A tick
+has two steps: its state goes to the sink at once; its other messages go with `flush`, or before anything else is done. So
+a live run can deliver the state to its readers before the work on the other messages begins, and the messages are the
+same whether it does or not.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from fusiond.events import ImuSample, Received
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.outcomes import totals
-from fusiond.messages.schedule import RATE_DENOMINATOR, Publication, Surroundings
+from fusiond.messages.schedule import RATE_DENOMINATOR, IoHealth, Publication
 from fusiond.messages.types import Message, StateMessage
+from fusiond.units import SECOND
 
-SECOND = 1_000_000_000  # ns
-MAX_SILENCE_NS = 60 * SECOND  # ticks go on for this long after an event; a longer hole is passed over
+MAX_SILENCE_NS = 60 * SECOND  # ticks continue for this long after an event; in a longer gap they are skipped
 
 Sink = Callable[[Message], None]
 
@@ -34,10 +34,10 @@ Sink = Callable[[Message], None]
 class Engine:
     """The fusion of one vehicle, its ticks, and what is published at them.
 
-    `sink` takes every message, of all kinds or, with `only_states`, the states alone; without a sink there are no ticks.
-    `rate_hz` of the ticks is by default the configuration's. `surroundings` tells what the health says of the shell.
-    `pace` is called with the time [ns from the first event] before each tick and each event, and may sleep. `stored` is for
-    a hot start; StoredStateError where it is not for this configuration.
+    `sink` gets every message, or with `only_states` only the states; without a sink there are no ticks. `rate_hz` of the
+    ticks is by default the configuration's. `io_health` returns the health of inputs and outputs. `pace` is called with the
+    time [ns from the first event] before each tick and each event, and may sleep. `stored_state` is for a hot start.
+    Raises StoredStateError if it is not for this configuration.
     """
 
     def __init__(
@@ -47,54 +47,54 @@ class Engine:
         *,
         rate_hz: float | None = None,
         only_states: bool = False,
-        surroundings: Callable[[], Surroundings] = Surroundings,
+        io_health: Callable[[], IoHealth] = IoHealth,
         pace: Callable[[int], None] | None = None,
-        stored: StoredState | None = None,
+        stored_state: StoredState | None = None,
     ) -> None:
-        self.fusion = Fusion(config, stored=stored)
-        self.publication = None if sink is None or only_states else Publication(config, self.fusion, surroundings)
+        self.fusion = Fusion(config, stored=stored_state)
+        self.publication = None if sink is None or only_states else Publication(config, self.fusion, io_health)
         self.first_ns: int | None = None  # receipt of the first event
         self.now_ns = 0  # latest receipt so far
-        self.ticks = self.skipped = 0  # made, and passed over in long silences
+        self.ticks = self.skipped = 0  # made, and skipped in long gaps
         self._vehicle = config.vehicle.name
         self._sink, self._pace = sink, pace
         self._period = SECOND / Fraction(rate_hz or config.publish.rate_hz).limit_denominator(RATE_DENOMINATOR)
-        self._wait_ns = int(self._period / 2) if config.publish.on_imu else 0  # of a tick for an inertial sample
+        self._wait_ns = int(self._period / 2) if config.publish.on_imu else 0  # how long a tick waits for an inertial sample
         self._imu = self.fusion.plan.sources[self.fusion.plan.imu_source]
         self._tick = 0  # number of the next tick
-        self._prepared: StateMessage | None = None  # its message, if nothing comes before it
-        self._last: tuple[int, StateMessage] | None = None  # time and state of the last tick, until its rest has gone out
+        self._prepared: StateMessage | None = None  # its state, if no event comes before it
+        self._last: tuple[int, StateMessage] | None = None  # the last tick, until its other messages are published
 
     @property
     def elapsed_ns(self) -> int:
-        """How much of the drive has passed, by receipts."""
+        """Time from the first receipt to the latest."""
         return 0 if self.first_ns is None else self.now_ns - self.first_ns
 
     @property
     def next_tick_ns(self) -> int | None:
-        """When the next tick is made, if no inertial sample has it made sooner; None before the first event."""
+        """When the next tick is made, unless an inertial sample triggers it sooner; None before the first event."""
         return None if self.first_ns is None else self.first_ns + self._since(self._tick) + self._wait_ns
 
     @property
     def unfinished(self) -> bool:
-        """Whether only the state of the last tick has gone out yet."""
+        """Whether only the state of the last tick has been published yet."""
         return self._last is not None
 
-    # --- What drives it
+    # --- Events and time
 
     def feed(self, event: Received) -> Receipt | None:
-        """Let time pass up to an event's receipt, fuse it, and publish what is due. None where it taught the clock only."""
+        """Advance to an event's receipt, fuse it, and publish what is due. None if the event was for the clock only."""
         self.advance(event.t_receive_ns)
         receipt = self.fusion.feed(event)
         if receipt is not None:
             if self.publication:
                 self.publication.add(event, receipt)
             if self._wait_ns and event.source == self._imu:
-                self._make_tick_that_waited(event)
+                self._make_waiting_tick(event)
         return receipt
 
     def advance(self, t_receive_ns: int) -> None:
-        """Let time pass up to a receipt; one that is earlier than the one before it counts as received with that."""
+        """Make the ticks before a receipt. A receipt earlier than the latest counts as simultaneous with it."""
         if self.first_ns is None:
             self.first_ns = self.now_ns = t_receive_ns
         if t_receive_ns > self.now_ns:
@@ -106,18 +106,18 @@ class Engine:
             self._pace(self.elapsed_ns)
 
     def elapse(self, t_ns: int) -> None:
-        """Make the ticks up to an instant before which no event can come any more."""
+        """Make the ticks up to an instant, when no earlier event can come any more."""
         if self.first_ns is not None:
             self._make_ticks_before(t_ns + 1)
 
     def prepare(self) -> None:
-        """Make the next tick's state beforehand. The tick makes it anew where an event comes before it."""
+        """Make the state of the next tick in advance. If an event comes before the tick, it is made again."""
         due = self.next_tick_ns
         if due is not None and self._prepared is None and due < self.now_ns + MAX_SILENCE_NS:
             self._prepared = self.message(due)
 
     def flush(self) -> None:
-        """Publish what is due besides the state at the last tick."""
+        """Publish the other messages of the last tick."""
         if self._last is not None:
             (since_ns, state), self._last = self._last, None
             if self.publication and self._sink:
@@ -125,18 +125,18 @@ class Engine:
                     self._sink(message)
 
     def finish(self) -> None:
-        """Make the ticks up to the last event, whole."""
+        """Make the ticks up to the last event, with all their messages."""
         self.elapse(self.now_ns)
         self.flush()
 
     def message(self, t_ns: int) -> StateMessage:
-        """The state at an instant."""
+        """The state message of an instant."""
         return state_message(self.fusion.solution_at(t_ns), self._vehicle, totals(self.fusion))
 
     # --- Ticks
 
     def _since(self, number: int) -> int:
-        """The instant of a tick, from the first event."""
+        """The instant of a tick [ns from the first event]."""
         return number * self._period.numerator // self._period.denominator
 
     def _make_ticks_before(self, t_ns: int) -> None:
@@ -152,13 +152,13 @@ class Engine:
             self.skipped += following - self._tick
             self._tick, self._prepared = following, None
 
-    def _make_tick_that_waited(self, event: Received) -> None:
-        """For an inertial sample, which has come now."""
+    def _make_waiting_tick(self, event: Received) -> None:
+        """Make the tick that waited for this inertial sample, if one did."""
         if self._sink and isinstance(event.payload, ImuSample) and self._since(self._tick) <= self.elapsed_ns:
             self._make_tick(self.elapsed_ns)
 
     def _make_tick(self, since_ns: int) -> None:
-        """The next tick, at an instant [from the first event]: its state."""
+        """Publish the state of the next tick, at an instant [ns from the first event]."""
         assert self.first_ns is not None and self._sink is not None
         self.flush()
         if self._pace:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from fusiond.config.schema import Config
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
-from fusiond.ports.inputs import Inbox, LiveInput, Receiver
+from fusiond.ports.inputs import Inbox, InputContext, LiveInput
 from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.can.kernel_socket import CanFrame
 
@@ -72,7 +72,7 @@ class CanBus:
     def decode(self, item: CanFrame, t_ns: int) -> list[Received]:
         """The wheel speeds in a frame. An error frame has none and is counted."""
         if item.is_error:
-            self._take_error(item)
+            self._count_error(item)
             return []
         if item.is_remote:
             self._seen["remote frames"] += 1
@@ -80,7 +80,7 @@ class CanBus:
         assert self.decoder is not None  # frames come only after prepare
         return self.decoder.decode(item.arbitration_id, item.is_extended, item.data, t_ns)
 
-    def _take_error(self, item: CanFrame) -> None:
+    def _count_error(self, item: CanFrame) -> None:
         """Count an error frame; one line in the log when the controller's state changes."""
         self._seen["error frames"] += 1
         classes, detail = item.arbitration_id, item.data[1] if len(item.data) > 1 else 0
@@ -121,11 +121,11 @@ class CanBus:
         return {**own, **{name: count for name, count in self._seen.items() if count}, **decoded}
 
 
-def make(config: Config, receiver: Receiver) -> Sequence[LiveInput[Any]]:
+def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:
     """The bus of each [can.NAME]."""
 
     def bus(name: str) -> CanBus:
-        inbox = Inbox(config.live.queue_frames, receiver.wake, attrgetter("arbitration_id"))
-        return CanBus(config, name, inbox, receiver.clock)
+        inbox = Inbox(config.live.queue_frames, context.wake, attrgetter("arbitration_id"))
+        return CanBus(config, name, inbox, context.clock)
 
     return [bus(name) for name in config.can]

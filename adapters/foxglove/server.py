@@ -10,7 +10,7 @@ from threading import Event
 
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
-from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.foxglove.converter import SHOWN, Converter, channels
 
 try:
@@ -88,6 +88,6 @@ class FoxgloveServer:
             one.close()
 
 
-def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
     """The output of a configuration."""
     return [FoxgloveServer(config)]

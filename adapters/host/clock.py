@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-OLDEST_NS = 2_000_000_000  # a kernel stamp older than this when it is read is rejected
+MAX_AGE_NS = 2_000_000_000  # a kernel stamp older than this when it is read is rejected
 
 
 class HostClock:
@@ -27,4 +27,4 @@ class HostClock:
         """The instant of a recent wall clock stamp: as long before now as the wall clock says. Now itself where that is
         implausible: the wall clock was set in between, or the stamp is of another clock."""
         age_ns = time.time_ns() - wall_ns
-        return self.now_ns() - (age_ns if 0 <= age_ns <= OLDEST_NS else 0)
+        return self.now_ns() - (age_ns if 0 <= age_ns <= MAX_AGE_NS else 0)

@@ -19,7 +19,7 @@ OTHERS = (  # lines as candump itself writes them, of data frames whose ids are 
     rb"((?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%(ids)b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*+\n)*+)"
 )
 WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*+)\n)?+"  # such a line with an id that is among them
-LONGEST_LINE = 1 << 16  # bytes; more without a line's end is no text
+MAX_LINE = 1 << 16  # bytes; more without a line's end is no text
 ERROR_FLAG = 0x20000000  # in the 8-digit ids of candump
 
 
@@ -92,7 +92,7 @@ def _whole_lines(log: LogFile) -> Iterator[bytes]:
             rest = tail
         else:
             rest += tail
-        if len(rest) > LONGEST_LINE:
+        if len(rest) > MAX_LINE:
             log.counts["bad lines"] += 1
             rest = b""
     if rest:

@@ -22,7 +22,7 @@ from fusiond_adapters.logs.file import LogFile
 from fusiond_adapters.mavlink.decoder import frame_length
 from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
-SHORTEST_S = 0.0005  # no sleep is shorter: records that are due within this are sent together
+MIN_SLEEP_S = 0.0005  # no sleep is shorter: records that are due within this are sent together
 BEHIND_NS = 20_000_000  # the clock waits for a daemon that is further behind
 LOOK_S = 0.0002  # between two looks at it
 PATIENCE_S = 1.0  # longest wait: the drive may have a gap
@@ -118,7 +118,7 @@ class Player:
 
 
 def _sleep(seconds: float) -> None:
-    if seconds > SHORTEST_S:
+    if seconds > MIN_SLEEP_S:
         time.sleep(seconds)
 
 

@@ -22,10 +22,10 @@ from fusiond_adapters.mavlink.decoder import (
     CHECKSUM,
     HEADER_2,
     LENGTH_KNOWN,
-    LONGEST_FRAME,
     MAGIC,
     MAGIC_1,
     MAGIC_2,
+    MAX_FRAME_BYTES,
     SIGNATURE,
     SIGNED,
     MavlinkDecoder,
@@ -40,7 +40,7 @@ MAGICS = (MAGIC_1, MAGIC_2)
 STAMP_UNTIL_US = 4_102_444_800 * 10**6  # 2100
 RESYNC_REACH_US = 366 * 86_400 * 10**6  # a record found after garbage is stamped within a year of the one before
 STEP_US = 10**6  # a stamp that jumps by more is compared with the next one
-REACH = 2 * (STAMP_SIZE + LONGEST_FRAME)  # bytes in which a whole record and the next one's beginning lie
+REACH = 2 * (STAMP_SIZE + MAX_FRAME_BYTES)  # bytes in which a whole record and the next one's beginning lie
 
 
 def open_log(opening: Opening) -> Reading:
@@ -114,7 +114,7 @@ class _Records:
     def _plain(self, at: int) -> Generator[list[Received], None, int]:
         """Cut the ordinary MAVLink 2 records from `at` on. Returns where the buffer ends, or where a record needs a closer
         look."""
-        buffer, unpack, take = self._buffer, RECORD_2.unpack_from, self._decoder.take
+        buffer, unpack, decode = self._buffer, RECORD_2.unpack_from, self._decoder.decode_by_header
         until, records, last_us = len(buffer) - REACH, 0, self._last_us
         while at <= until and last_us is not None:
             stamp_us, magic, size, flags, _, counter, system, component, low, middle, high = unpack(buffer, at)
@@ -126,7 +126,7 @@ class _Records:
             last_us = stamp_us
             records += 1
             number, frame = low | middle << 8 | high << 16, buffer[at + STAMP_SIZE : end]
-            events = take(number, counter, system, component, frame, stamp_us * MICROSECOND)
+            events = decode(number, counter, system, component, frame, stamp_us * MICROSECOND)
             at = end
             if events:
                 yield events

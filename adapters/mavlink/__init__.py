@@ -1,1 +1,1 @@
-"""MAVLink: frames in, sensors out of them, requests, signing, and what is sent to autopilot and ground station."""
+"""MAVLink: frames to events of sensors, requests, signing, and outputs to the autopilot and a ground station."""

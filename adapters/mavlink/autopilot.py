@@ -1,9 +1,9 @@
-"""The state sent to the autopilot as a source of its own estimator, and whether that estimator uses it.
+"""The state sent to the autopilot as an aiding measurement of its own estimator, and whether that estimator uses it.
 
 Messages go out on the open link of a MAVLink input, from this output's own thread. Only a state within the configured
-limits is sent; the health says why one is not, and so does one STATUSTEXT. Whether the autopilot uses the state is read
-from its EKF_STATUS_REPORT or ESTIMATOR_STATUS, which the link requests (`talk`), and from the STATUSTEXTs of ArduPilot's
-EKF3: "is using external nav data", "stopped aiding".
+limits is sent; if one is not, the health and a STATUSTEXT give the reason. Whether the autopilot uses the state is read
+from its EKF_STATUS_REPORT or ESTIMATOR_STATUS, which the link requests (see `housekeeping`), and from the STATUSTEXTs of
+ArduPilot's EKF3: "is using external nav data", "stopped aiding".
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from fusiond_adapters.mavlink.answers import Parameter
 from fusiond_adapters.mavlink.decoder import message_id
 from fusiond_adapters.mavlink.link import MavlinkLink
 from fusiond_adapters.mavlink.outgoing import (
-    FORMS,
+    CONVENTIONS,
     Origin,
-    Pace,
+    RateLimiter,
     gps_input,
     odometry,
     set_origin,
@@ -37,11 +37,11 @@ from fusiond_adapters.mavlink.outgoing import (
 )
 
 OUTBOX = 64  # messages
-MIN_HZ = 4.0  # ArduPilot gives up a source below this rate
-STALE_NS = SECOND  # a state that waited for longer is not sent
-SILENT_NS = 5 * SECOND  # an older estimator status is ignored
+MIN_HZ = 4.0  # below this rate ArduPilot stops using the data
+MAX_AGE_NS = SECOND  # an older state is not sent
+MAX_STATUS_AGE_NS = 5 * SECOND  # an older estimator status is ignored
 TEXT_NS = 5 * SECOND  # between two STATUSTEXTs
-ORIGIN_NS = 2 * SECOND  # between two SET_GPS_GLOBAL_ORIGINs, until the autopilot names its origin
+ORIGIN_NS = 2 * SECOND  # between two SET_GPS_GLOBAL_ORIGINs, until the autopilot reports its origin
 ORIGIN_APART_M = 1.0  # a larger distance between the autopilot's origin and ours is reported
 GATE = 1.0  # of a test ratio
 ARDUPILOT_UNINITIALISED = 1024  # EKF_STATUS_FLAGS; in ESTIMATOR_STATUS the bit means a GPS glitch
@@ -50,7 +50,7 @@ NAMES = {dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", dialect.MAV_AUTOPILOT
 EXTERNAL_NAV = re.compile(r"EKF\d IMU\d+ is using external nav data")
 STOPPED_AIDING = re.compile(r"EKF\d IMU\d+ stopped aiding")
 
-HEARD = {
+READ = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT,
     dialect.MAVLINK_MSG_ID_STATUSTEXT,
     dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
@@ -60,7 +60,7 @@ HEARD = {
 
 
 def unfit(message: StateMessage, limits: Autopilot) -> tuple[str, str] | None:
-    """Why a state must not be sent: the kind of reason in a word, and in full. None: it may be sent."""
+    """Why a state must not be sent: the kind of reason in one word, and the reason in full. None: it may be sent."""
     state = message.state
     if state is None or message.mode in (Mode.ALIGNING, Mode.LOST):
         return message.mode.value, message.fault or message.mode.value.replace("_", " ")
@@ -90,34 +90,34 @@ def quality(state: State, limits: Autopilot) -> int:
 
 
 class Readback:
-    """The autopilot's reports on its own estimator. `hear` is called by the link's thread."""
+    """The autopilot's reports on its own estimator. `receive` is called by the link's thread."""
 
     def __init__(self, link: MavlinkLink, kind: str) -> None:
         self.origin: Origin | None = None  # of its local frame; its height is above the sea
         self._link, self._kind = link, kind
         self._parser = dialect.MAVLink(None)
-        self._is = kind  # the kind that its heartbeat gives
-        self._said_external: bool | None = None
+        self._actual_kind = kind  # according to its heartbeat
+        self._uses_external: bool | None = None  # according to its STATUSTEXTs
         self._report: tuple[int, int, Sequence[float]] | None = None  # stamp, flags, ratios
 
-    def hear(self, frame: bytes, t_ns: int) -> None:
-        """Take a frame of the link."""
-        if message_id(frame) not in HEARD:
+    def receive(self, frame: bytes, t_ns: int) -> None:
+        """Read a frame of the link."""
+        if message_id(frame) not in READ:
             return
         try:
             message = self._parser.decode(bytearray(frame))
         except dialect.MAVError:
             return  # another dialect's message with this number, or a damaged frame
-        if (message.get_srcSystem(), message.get_srcComponent()) != self._link.talk.target:
+        if (message.get_srcSystem(), message.get_srcComponent()) != self._link.housekeeping.target:
             return
         kind = message.get_msgId()
         if kind == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            self._is = NAMES.get(message.autopilot, self._kind)
+            self._actual_kind = NAMES.get(message.autopilot, self._kind)
         elif kind == dialect.MAVLINK_MSG_ID_STATUSTEXT:
             if EXTERNAL_NAV.search(message.text):
-                self._said_external = True
+                self._uses_external = True
             elif STOPPED_AIDING.search(message.text):
-                self._said_external = False
+                self._uses_external = False
         elif kind == dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             self.origin = Origin(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
         elif kind == dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
@@ -132,26 +132,26 @@ class Readback:
 
     def verdict(self, now_ns: int) -> str:
         """Whether the autopilot uses the state. The first word is yes, no, likely or unknown."""
-        if self._is != self._kind:
-            return f"no: the autopilot says it is {self._is}, [autopilot] kind is {self._kind}"
+        if self._actual_kind != self._kind:
+            return f"no: the autopilot says it is {self._actual_kind}, [autopilot] kind is {self._kind}"
         report = self._report
-        if report is None or now_ns - report[0] > SILENT_NS:
-            return "unknown: the autopilot does not tell of its estimator"
+        if report is None or now_ns - report[0] > MAX_STATUS_AGE_NS:
+            return "unknown: the autopilot does not report its estimator's status"
         _, flags, ratios = report
         worst = max((ratio for ratio in ratios if math.isfinite(ratio)), default=math.nan)
         objections = (
             (not flags & dialect.ESTIMATOR_ATTITUDE, "its estimator is not initialised"),
             (flags & dialect.ESTIMATOR_CONST_POS_MODE, "it assumes a constant position"),
             (not flags & HAS_POSITION, "it has no horizontal position"),
-            (self._said_external is False, "it said that it stopped aiding"),
+            (self._uses_external is False, "it reported that it stopped aiding"),
             (worst >= GATE, f"it rejects measurements, worst test ratio {worst:.2f}"),
         )
         found = next((text for applies, text in objections if applies), None)
         if found:
             return f"no: {found}"
-        if self._said_external:
-            return f"yes: it says so; worst test ratio {worst:.2f}"
-        return f"likely: it has a position, worst test ratio {worst:.2f}; it does not say from whom"
+        if self._uses_external:
+            return f"yes: it reports so; worst test ratio {worst:.2f}"
+        return f"likely: it has a position, worst test ratio {worst:.2f}; it does not report from which source"
 
 
 class AutopilotOutput:
@@ -162,38 +162,38 @@ class AutopilotOutput:
     def __init__(self, config: Config, link: MavlinkLink, now: Callable[[], int]) -> None:
         self._settings, self._geoid_m = config.autopilot, config.vehicle.geoid_m
         self._link, self._now = link, now
-        self._form = FORMS[self._settings.kind]
+        self._conventions = CONVENTIONS[self._settings.kind]
         self.outbox = Outbox(OUTBOX, (StateMessage,))
         self.about = f"{self._settings.message} to {self._settings.kind} over MAVLink {self._settings.link}"
-        self.pace, self._max_hz = Pace(self._settings.rate_hz), config.publish.rate_hz
+        self.limiter, self._max_hz = RateLimiter(self._settings.rate_hz), config.publish.rate_hz
         self.readback = Readback(link, self._settings.kind)
         self.origin: Origin | None = None  # of the local frame: the first fit position, kept
         self._counts = dict.fromkeys(("sent", "not fit", "stale", "link closed or full"), 0)
         self._unfit: tuple[str, str] | None = ("none", "no state yet")
-        self._passed = True  # the link took the last one
-        self._told = "none"  # kind of reason in the last STATUSTEXT
+        self._passed = True  # the link accepted the last one
+        self._reported = "none"  # kind of reason in the last STATUSTEXT
         self._texts, self._next_text_ns, self._next_origin_ns = 0, 0, 0
 
     def session(self, stop: Event) -> None:
         """Send states until `stop` is set. The link's input opens and closes it; states while it is closed are lost and
         counted."""
-        self._link.listeners.append(self.readback.hear)
+        self._link.listeners.append(self.readback.receive)
         try:
             while not stop.is_set():
                 for message in self.outbox.take(POLL_S):
                     if isinstance(message, StateMessage):
                         self.offer(message)
         finally:
-            self._link.listeners.remove(self.readback.hear)
+            self._link.listeners.remove(self.readback.receive)
 
     def offer(self, message: StateMessage) -> None:
         """Send a state if it is fit and due; otherwise report why not."""
-        if self._now() - message.t_ns > STALE_NS:
+        if self._now() - message.t_ns > MAX_AGE_NS:
             self._counts["stale"] += 1
             return
         self._unfit = unfit(message, self._settings)
-        self._tell(message.t_ns)
-        if not self.pace.due(message.t_ns):
+        self._report(message.t_ns)
+        if not self.limiter.due(message.t_ns):
             return
         if self._unfit or message.state is None:
             self._counts["not fit"] += 1
@@ -202,7 +202,7 @@ class AutopilotOutput:
             self.origin = Origin.of(message.state)
         if self._settings.set_origin and self.readback.origin is None and message.t_ns >= self._next_origin_ns:
             self._next_origin_ns = message.t_ns + ORIGIN_NS
-            self._link.send(set_origin(message, self.origin, self._geoid_m, (self._link.talk.target or (0, 0))[0]))
+            self._link.send(set_origin(message, self.origin, self._geoid_m, (self._link.housekeeping.target or (0, 0))[0]))
         self._passed = self._link.send(self._packed(message, message.state, self.origin))
         self._counts["sent" if self._passed else "link closed or full"] += 1
 
@@ -210,40 +210,40 @@ class AutopilotOutput:
         if self._settings.message == "gps_input":
             return gps_input(message, state, self._geoid_m, self._settings.gps_id)
         if self._settings.message == "vision_position":
-            return vision_position(message, state, origin, self._form)
-        return odometry(message, state, origin, self._form, quality(state, self._settings))
+            return vision_position(message, state, origin, self._conventions)
+        return odometry(message, state, origin, self._conventions, quality(state, self._settings))
 
-    def _tell(self, t_ns: int) -> None:
-        """Report in a STATUSTEXT whether states are sent from now on, no more often than people can read."""
+    def _report(self, t_ns: int) -> None:
+        """Report by STATUSTEXT whether states are sent from now on, at most once in TEXT_NS."""
         word = self._unfit[0] if self._unfit else ""
-        if word == self._told or t_ns < self._next_text_ns:
+        if word == self._reported or t_ns < self._next_text_ns:
             return
         text = f"fusiond: not sent to the autopilot: {self._unfit[1]}" if self._unfit else "fusiond: sent to the autopilot"
         severity = dialect.MAV_SEVERITY_WARNING if self._unfit else dialect.MAV_SEVERITY_INFO
         self._texts = self._texts % 0xFFFF + 1
         if all(self._link.send(chunk) for chunk in status_texts(severity, text, self._texts)):
-            self._told = word
+            self._reported = word
             self._next_text_ns = t_ns + TEXT_NS
 
     def parameter(self) -> Parameter:
-        """Its rate, to be offered to a ground station."""
-        return Parameter("AP_RATE_HZ", lambda: self.pace.rate_hz, self._set_rate, MIN_HZ, self._max_hz)
+        """Its rate, as a parameter for a ground station."""
+        return Parameter("AP_RATE_HZ", lambda: self.limiter.rate_hz, self._set_rate, MIN_HZ, self._max_hz)
 
     def _set_rate(self, rate_hz: float) -> None:
-        self.pace.rate_hz = rate_hz
+        self.limiter.rate_hz = rate_hz
 
     def counts(self) -> dict[str, int]:
         """Counts of the states that were due; `not fit` are those that must not be sent."""
         return dict(self._counts)
 
     def notes(self) -> dict[str, str]:
-        """Whether states are sent, whether the autopilot uses them, and where its local frame begins, if not with ours."""
+        """Whether states are sent, whether the autopilot uses them, and the origin of its local frame if it is not ours."""
         unfit_now = self._unfit
-        obstacle = unfit_now[1] if unfit_now else "" if self._passed else "the link is closed or full"
-        notes = {"sending": f"no: {obstacle}" if obstacle else "yes", "used": self.readback.verdict(self._now())}
+        reason = unfit_now[1] if unfit_now else "" if self._passed else "the link is closed or full"
+        notes = {"sending": f"no: {reason}" if reason else "yes", "used": self.readback.verdict(self._now())}
         theirs, ours = self.readback.origin, self.origin
         if theirs and ours:
-            north, east = self._form.on(ours, theirs.latitude_deg, theirs.longitude_deg)
+            north, east = self._conventions.project(ours, theirs.latitude_deg, theirs.longitude_deg)
             apart = (north * north + east * east) ** 0.5
             if apart > ORIGIN_APART_M and self._settings.message != "gps_input":
                 notes["origin"] = f"the autopilot's local frame begins {apart:.1f} m from ours"

@@ -4,10 +4,10 @@ Only the messages that the configuration asks for are checked and decoded; of al
 layouts and checksum seeds are those of pymavlink's dialect modules. A frame's missing tail (MAVLink 2 cuts trailing
 zeros, MAVLink 1 has no extension fields) reads as zero, which is "unknown" in every extension field used here.
 
-Whose frames count: those of the configured system, or where that is 0 those of the autopilot whose HEARTBEAT comes
-first. Until it comes, the first system that sends a wanted IMU or GNSS message stands in, so that a log without
-heartbeats can be read and nothing of the first second is lost. Ground stations, and components that are no autopilot
-(MAV_AUTOPILOT_INVALID), are never learnt.
+Frames are decoded from one system: the configured one, or if that is 0 the autopilot whose HEARTBEAT comes first. Until
+then the first system that sends a wanted IMU or GNSS message is used, so that a log without heartbeats can be read and
+the first second is not lost. Ground stations and components that are no autopilot (MAV_AUTOPILOT_INVALID) are never
+chosen.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from fusiond.events import (
     Received,
     boot_clock,
 )
+from fusiond.units import MICROSECOND, MILLISECOND
 from fusiond_adapters.mavlink.sensors import HANDLERS
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
@@ -42,28 +43,28 @@ HEADER_1, HEADER_2, CHECKSUM, SIGNATURE = 6, 10, 2, 13  # bytes
 SENDER_1 = Struct("<BBBB")  # at 2: counter, system, component, message id
 SENDER_2 = Struct("<BBBHB")  # at 4: the same, the id in two parts
 LENGTH_KNOWN = 3  # bytes of a frame that give its length
-LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
+MAX_FRAME_BYTES = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 
 HEARTBEAT = "HEARTBEAT"
 SYSTEM_TIME = "SYSTEM_TIME"
 TIMESYNC = "TIMESYNC"
 NO_SENSORS = (HEARTBEAT, SYSTEM_TIME, TIMESYNC)
-TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: fusiond's questions are stamped in whole microseconds plus the mark
+TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: fusiond's requests are stamped in whole microseconds plus the mark
 TYPE_GROUND_STATION = 6  # MAV_TYPE_GCS
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 
 UNIX_FROM_US = 10**15  # a stamp beyond this is Unix time (from 2001-09), below it counts from boot
-UNIX_UNTIL_US = 4_102_444_800 * 10**6  # 2100: beyond this it is garbage
-CLOCK_SET_US = 1_262_304_000 * 10**6  # 2010: an autopilot that says less has not set its clock
-LONGEST_GAP = 128  # a longer jump of the frame counter is a repeat or a reordering, not a loss
+UNIX_UNTIL_US = 4_102_444_800 * 10**6  # 2100: a later stamp is invalid
+CLOCK_SET_US = 1_262_304_000 * 10**6  # 2010: before this the autopilot's clock is not set
+MAX_LOST = 128  # a larger jump of the frame counter is a repeat or a reordering, not a loss
 
 Bytes = bytes | bytearray
 Pick = Callable[[tuple[Any, ...]], tuple[Any, ...]]
-Take = Callable[[tuple[Any, ...], int], list[Received]]  # fields, receive stamp [ns]
+EventsOf = Callable[[tuple[Any, ...], int], list[Received]]  # fields, receive stamp [ns]
 
 
 def frame_length(buffer: Bytes, at: int = 0) -> int:
-    """Length in bytes of the frame that begins at `at`, by its first three bytes; 0 where none can begin."""
+    """Length in bytes of the frame that begins at `at`, from its first three bytes; 0 if no frame begins there."""
     magic = buffer[at]
     if magic == MAGIC_2:
         flags = buffer[at + 2]
@@ -127,7 +128,7 @@ class FrameSplitter:
         self.skipped_bytes = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take the next bytes of the stream; give the frames that are now complete."""
+        """Add the next bytes of the stream; returns the frames that are now complete."""
         buffer = self._buffer
         buffer += data
         frames = []
@@ -153,8 +154,8 @@ class FrameSplitter:
         return frames
 
     def _judge(self, at: int, length: int) -> bool | None:
-        """Is this complete frame one? A message of unknown checksum is accepted when it stands between frames; None
-        where that takes the next byte, which is not here yet."""
+        """Whether this complete frame is sound. A message of unknown checksum is accepted between two frames; None if that
+        depends on the next byte, which has not been received yet."""
         end = at + length
         sound = self._dialect.sound(bytes(self._buffer[at:end]))
         if sound is not None:
@@ -165,21 +166,21 @@ class FrameSplitter:
 
 
 class _Reader:
-    """One wanted message: its layout, and what makes events of its fields. Only the fields that any of the `takers` asks
-    for are unpacked, and each taker gets its own; a field that is an array gives as many values."""
+    """One wanted message: its layout, and the functions that make events of its fields. Only the fields that any of the
+    `handlers` needs are unpacked, and each handler gets its own; an array field gives as many values."""
 
-    def __init__(self, kind: Any, takers: list[tuple[tuple[str, ...], Take]]) -> None:
-        fields = tuple(dict.fromkeys(field for wanted, _ in takers for field in wanted))
+    def __init__(self, kind: Any, handlers: list[tuple[tuple[str, ...], EventsOf]]) -> None:
+        fields = tuple(dict.fromkeys(field for wanted, _ in handlers for field in wanted))
         layout = _layout(kind, fields)
         self._unpack: Callable[[bytes], tuple[Any, ...]] = layout.unpack
         self._size = layout.size
         self._pick = _pick(kind, [name for name in kind.ordered_fieldnames if name in fields], fields)
         self.seed = _seed(kind)
         self.is_sensor = kind.msgname not in NO_SENSORS
-        self.takers = [_picking(take, _pick(kind, fields, wanted)) for wanted, take in takers]
+        self.handlers = [_picking(events, _pick(kind, fields, wanted)) for wanted, events in handlers]
 
     def fields(self, frame: bytes) -> tuple[Any, ...]:
-        """All the fields asked for, of a frame whose checksum is right."""
+        """All the fields that the handlers need, of a frame whose checksum is right."""
         start, size = HEADER_2 if frame[0] == MAGIC_2 else HEADER_1, self._size
         present = frame[1]
         payload = frame[start : start + (present if present < size else size)]
@@ -193,7 +194,7 @@ def _codes(kind: Any) -> dict[str, str]:
 
 
 def _layout(kind: Any, fields: tuple[str, ...]) -> Struct:
-    """What unpacks those fields alone, in the order of the wire, up to the last of them."""
+    """The struct that unpacks only those fields, in the order of the wire, up to the last of them."""
     codes = _codes(kind)
     last = max(map(kind.ordered_fieldnames.index, fields))
     parts = (code if name in fields else f"{calcsize('<' + code)}x" for name, code in list(codes.items())[: last + 1])
@@ -201,7 +202,7 @@ def _layout(kind: Any, fields: tuple[str, ...]) -> Struct:
 
 
 def _pick(kind: Any, given: Sequence[str], wanted: Sequence[str]) -> Pick | None:
-    """What picks the values of the fields `wanted` out of those of the fields `given`; None where they are the same."""
+    """A function that picks the values of the fields `wanted` out of those of the fields `given`; None if they are equal."""
     places: dict[str, list[int]] = {}
     codes, count = _codes(kind), 0
     for name in given:
@@ -214,30 +215,30 @@ def _pick(kind: Any, given: Sequence[str], wanted: Sequence[str]) -> Pick | None
     return itemgetter(*order) if len(order) > 1 else lambda values: (values[order[0]],)
 
 
-def _picking(take: Take, pick: Pick | None) -> Take:
-    return take if pick is None else lambda fields, t_receive_ns: take(pick(fields), t_receive_ns)
+def _picking(events: EventsOf, pick: Pick | None) -> EventsOf:
+    return events if pick is None else lambda fields, t_receive_ns: events(pick(fields), t_receive_ns)
 
 
 class MavlinkDecoder:
     """The sources of one [mavlink.NAME] link.
 
     `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
-    `counts` says what became of the frames. Raises ConfigError where the dialect lacks a wanted message.
+    `counts` has the number of frames by outcome. Raises ConfigError where the dialect lacks a wanted message.
     """
 
     def __init__(self, config: Config, link: str, sequences: dict[str, int] | None = None) -> None:
         settings = config.mavlink[link]
         self.link = link
-        self.system = settings.system  # the system whose frames are taken; 0: none yet
-        self.settled = settings.system != 0  # configured, or an autopilot has been heard
+        self.system = settings.system  # the system whose frames are decoded; 0: none yet
+        self.found = settings.system != 0  # configured, or an autopilot's heartbeat was received
         try:
             self.dialect = Dialect(settings.dialect)
             self._readers = self._make_readers(config)
         except ConfigError as error:
             raise ConfigError(f"mavlink.{link}.dialect: {error}") from error
         self._component = settings.component
-        self._autopilot = settings.component  # component that answers TIMESYNC; 0: not heard yet
-        self._sender = 0  # component of the frame at hand
+        self._autopilot = settings.component  # component that answers TIMESYNC; 0: not known yet
+        self._sender = 0  # component of the present frame
         self._boot_clock = boot_clock(link, self.system)
         self._sequences = {} if sequences is None else sequences
         self._next_counter: dict[int, int] = {}  # by component
@@ -251,14 +252,14 @@ class MavlinkDecoder:
             return []
         if frame[0] == MAGIC_2:
             counter, system, component, low, high = SENDER_2.unpack_from(frame, 4)
-            return self.take(low | high << 16, counter, system, component, frame, t_receive_ns)
+            return self.decode_by_header(low | high << 16, counter, system, component, frame, t_receive_ns)
         counter, system, component, number = SENDER_1.unpack_from(frame, 2)
-        return self.take(number, counter, system, component, frame, t_receive_ns)
+        return self.decode_by_header(number, counter, system, component, frame, t_receive_ns)
 
-    def take(
+    def decode_by_header(
         self, number: int, counter: int, system: int, component: int, frame: bytes, t_receive_ns: int
     ) -> list[Received]:
-        """The same, of a frame whose length is right and whose header says that: message id, frame counter, sender."""
+        """The same for a frame of the right length whose header has been read: message id, frame counter, sender."""
         reader = self._readers.get(number)
         if self._component and component != self._component:
             self.counts["other components"] += 1
@@ -271,7 +272,7 @@ class MavlinkDecoder:
             return []
         expected = self._next_counter.get(component, counter)
         self._next_counter[component] = counter + 1 & 0xFF
-        if counter != expected and (counter - expected) & 0xFF < LONGEST_GAP:
+        if counter != expected and (counter - expected) & 0xFF < MAX_LOST:
             self.counts["lost"] += (counter - expected) & 0xFF
         if reader is None:
             self.counts["skipped"] += 1
@@ -279,13 +280,13 @@ class MavlinkDecoder:
         self.counts["decoded"] += 1
         self._sender = component
         fields = reader.fields(frame)
-        if len(reader.takers) == 1:
-            return reader.takers[0](fields, t_receive_ns)
-        return [event for take in reader.takers for event in take(fields, t_receive_ns)]
+        if len(reader.handlers) == 1:
+            return reader.handlers[0](fields, t_receive_ns)
+        return [event for events in reader.handlers for event in events(fields, t_receive_ns)]
 
     def _adopt(self, system: int, reader: _Reader, frame: bytes) -> bool:
-        """Does this frame of a system not followed so far make it the one to follow?"""
-        if self.settled or system == 0 or not self.dialect.sound(frame):
+        """Whether this frame makes its system the one whose frames are decoded; if so, it is from now on."""
+        if self.found or system == 0 or not self.dialect.sound(frame):
             return False
         if reader is self._heartbeat:
             if not _is_autopilot(reader.fields(frame)):
@@ -298,38 +299,39 @@ class MavlinkDecoder:
         return True
 
     def _make_readers(self, config: Config) -> dict[int, _Reader]:
-        takers: dict[str, list[tuple[tuple[str, ...], Take]]] = {HEARTBEAT: [(("type", "autopilot"), self._take_heartbeat)]}
+        handlers: dict[str, list[tuple[tuple[str, ...], EventsOf]]] = {}
+        handlers[HEARTBEAT] = [(("type", "autopilot"), self._heartbeat_events)]
         if SYSTEM_TIME in self.dialect.ids:
-            takers[SYSTEM_TIME] = [(("time_unix_usec", "time_boot_ms"), self._take_system_time)]
+            handlers[SYSTEM_TIME] = [(("time_unix_usec", "time_boot_ms"), self._system_time_events)]
         if TIMESYNC in self.dialect.ids:
-            takers[TIMESYNC] = [(("tc1", "ts1"), self._take_timesync)]
+            handlers[TIMESYNC] = [(("tc1", "ts1"), self._timesync_events)]
         for _, name, section in config.sensors(link=self.link):
             handler = HANDLERS[type(section)](self, name, section, config)
             for message in section.messages():
-                takers.setdefault(message, []).append((handler.fields, handler.take))
-        readers = {message: _Reader(self.dialect.type_of(message), found) for message, found in takers.items()}
+                handlers.setdefault(message, []).append((handler.fields, handler.events))
+        readers = {message: _Reader(self.dialect.type_of(message), found) for message, found in handlers.items()}
         self._heartbeat = readers[HEARTBEAT]
         return {self.dialect.ids[message]: reader for message, reader in readers.items()}
 
-    def _take_heartbeat(self, fields: tuple[Any, ...], _t_receive_ns: int) -> list[Received]:
+    def _heartbeat_events(self, fields: tuple[Any, ...], _t_receive_ns: int) -> list[Received]:
         if _is_autopilot(fields):
-            self.settled, self._autopilot = True, self._autopilot or self._sender
+            self.found, self._autopilot = True, self._autopilot or self._sender
         return []
 
-    def _take_timesync(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
-        """The autopilot's answer to fusiond's question, recognised by its mark; all that is needed is in the frame."""
-        remote_ns, asked_ns = fields
-        if remote_ns <= 0 or self._sender != self._autopilot or asked_ns % TIMESYNC_STEP != TIMESYNC_MARK:
+    def _timesync_events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+        """The autopilot's answer to fusiond's request, recognised by its mark; the frame contains both stamps."""
+        remote_ns, sent_ns = fields
+        if remote_ns <= 0 or self._sender != self._autopilot or sent_ns % TIMESYNC_STEP != TIMESYNC_MARK:
             return []
         stamp = (self._boot_clock, remote_ns)
-        return [self.event(f"{self.link}.timesync", stamp, t_receive_ns, ClockPair(HOST_CLOCK, asked_ns))]
+        return [self.event(f"{self.link}.timesync", stamp, t_receive_ns, ClockPair(HOST_CLOCK, sent_ns))]
 
-    def _take_system_time(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+    def _system_time_events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         unix_us, boot_ms = fields
         if not CLOCK_SET_US <= unix_us < UNIX_UNTIL_US:
             return []
-        pair = ClockPair(self._boot_clock, boot_ms * 10**6)
-        return [self.event(f"{self.link}.time", (UNIX_CLOCK, unix_us * 1000), t_receive_ns, pair)]
+        pair = ClockPair(self._boot_clock, boot_ms * MILLISECOND)
+        return [self.event(f"{self.link}.time", (UNIX_CLOCK, unix_us * MICROSECOND), t_receive_ns, pair)]
 
     def event(self, source: str, stamp: tuple[str, int | None], t_receive_ns: int, payload: AnyPayload) -> Received:
         """The next event of a source. `stamp`: clock, sensor's stamp."""
@@ -338,11 +340,11 @@ class MavlinkDecoder:
         return Received(source, sequence, clock, t_sensor_ns, t_receive_ns, payload)
 
     def stamp(self, time_us: int) -> tuple[str, int | None]:
-        """Clock and stamp of a `time_usec` field, Unix or boot time by its magnitude; none where it is 0 or garbage."""
+        """Clock and stamp of a `time_usec` field, Unix or boot time by its magnitude; none if it is 0 or invalid."""
         if 0 < time_us < UNIX_FROM_US:
-            return self._boot_clock, time_us * 1000
+            return self._boot_clock, time_us * MICROSECOND
         if UNIX_FROM_US <= time_us < UNIX_UNTIL_US:
-            return UNIX_CLOCK, time_us * 1000
+            return UNIX_CLOCK, time_us * MICROSECOND
         return "", None
 
 

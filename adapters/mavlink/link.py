@@ -1,4 +1,4 @@
-"""The live input of one MAVLink link: frames from a transport into the inbox, and messages of fusiond back."""
+"""The live input of one MAVLink link: frames from a transport into the inbox, and messages from fusiond to the peer."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
-from fusiond.ports.inputs import POLL_S, Inbox, InputLost, LiveInput, Receiver
+from fusiond.ports.inputs import POLL_S, Inbox, InputContext, InputLost, LiveInput
 from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder, message_id
-from fusiond_adapters.mavlink.talk import MavlinkTalk
+from fusiond_adapters.mavlink.housekeeping import Housekeeping
 from fusiond_adapters.mavlink.tlog_record import tlog_record
 from fusiond_adapters.mavlink.transport import Transport, opener
 
@@ -21,7 +21,7 @@ log = logging.getLogger("fusiond")
 
 
 class MavlinkLink:
-    """One [mavlink.NAME]. `alive` says whether the estimator works: only then are heartbeats sent. `listeners` are called
+    """One [mavlink.NAME]. `alive` returns whether the estimator works: heartbeats are sent only then. `listeners` are called
     with every received frame and its stamp, in the link's thread: they must not wait.
 
     Raises ConfigError for a wrong connection string, or where the dialect lacks a wanted message.
@@ -49,7 +49,7 @@ class MavlinkLink:
         except ValueError as error:
             raise ConfigError(f"mavlink.{self.name}.connection: {error}") from error
         self.about = f"MAVLink {self.name} ({settings.connection})"
-        self.talk = MavlinkTalk(config, self.name)
+        self.housekeeping = Housekeeping(config, self.name)
 
     def prepare(self) -> None:
         """Nothing to load."""
@@ -71,16 +71,16 @@ class MavlinkLink:
                 self._transport = None
                 transport.close()
 
-    def send(self, message: Any, voice: Any = None) -> bool:
-        """Send a pymavlink message, from any thread, as fusiond or as another sender (`voice`, a pymavlink MAVLink). Never
-        waits for the peer. False: the link is closed or full, and the message is lost."""
+    def send(self, message: Any, sender: Any = None) -> bool:
+        """Send a pymavlink message, from any thread, as fusiond or as another `sender` (a pymavlink MAVLink). Never waits
+        for the peer. False: the link is closed or full, and the message is lost."""
         with self._sending:
             if self._transport is None:
                 return False
             try:
-                taken = self._transport.write(self.talk.pack(message, voice))
+                taken = self._transport.write(self.housekeeping.pack(message, sender))
             except (OSError, EOFError):
-                return False  # the link's own thread finds it lost
+                return False  # the link's own thread detects the loss
             self.sent += taken
             return taken
 
@@ -92,19 +92,19 @@ class MavlinkLink:
             t_ns = self._clock.now_ns()
             for chunk in chunks:
                 for frame in splitter.feed(chunk):
-                    if self.talk.signing and not self.talk.signing.accepts(frame):
+                    if self.housekeeping.signing and not self.housekeeping.signing.accepts(frame):
                         continue
                     self.inbox.put(t_ns, frame)
-                    with self._sending:  # it may pack an answer
-                        self.talk.hear(frame, t_ns)
+                    with self._sending:  # it may pack a reply
+                        self.housekeeping.receive(frame, t_ns)
                     for listen in self.listeners:
                         listen(frame, t_ns)
             self.skipped_bytes = skipped_before + splitter.skipped_bytes
-            while self.talk.news:
-                log.info("%s: %s", self.about, self.talk.news.pop(0))
+            while self.housekeeping.changes:
+                log.info("%s: %s", self.about, self.housekeeping.changes.pop(0))
             with self._sending:
-                for said in self.talk.say(self._clock.now_ns(), alive=self._alive()):
-                    self.sent += transport.write(said)
+                for frame in self.housekeeping.due(self._clock.now_ns(), alive=self._alive()):
+                    self.sent += transport.write(frame)
 
     def decode(self, item: bytes, t_ns: int) -> list[Received]:
         """The events in a frame."""
@@ -117,18 +117,18 @@ class MavlinkLink:
     def counts(self) -> dict[str, int]:
         """Counts of frames and of the link so far."""
         own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
-        asked = {f"asked for {name}": wanted.asked for name, wanted in self.talk.wanted.items()}
-        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.talk.wanted.items()}
-        signing = self.talk.signing.counts if self.talk.signing else {}
-        return {**own, "reboots": self.talk.reboots, **asked, **rates, **signing, **self.decoder.counts}
+        requests = {f"asked for {name}": wanted.requests for name, wanted in self.housekeeping.wanted.items()}
+        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.housekeeping.wanted.items()}
+        signing = self.housekeeping.signing.counts if self.housekeeping.signing else {}
+        return {**own, "reboots": self.housekeeping.reboots, **requests, **rates, **signing, **self.decoder.counts}
 
 
-def make(config: Config, receiver: Receiver) -> Sequence[LiveInput[Any]]:
+def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:
     """The link of each [mavlink.NAME]."""
 
     def link(name: str) -> MavlinkLink:
-        inbox: Inbox[bytes] = Inbox(config.live.queue_frames, receiver.wake, message_id)
-        return MavlinkLink(config, name, inbox, receiver.clock, receiver.is_alive)
+        inbox: Inbox[bytes] = Inbox(config.live.queue_frames, context.wake, message_id)
+        return MavlinkLink(config, name, inbox, context.clock, context.is_alive)
 
     return [link(name) for name in config.mavlink]
 

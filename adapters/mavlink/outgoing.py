@@ -1,9 +1,9 @@
-"""The state as MAVLink messages: for an autopilot's estimator, for a ground station, and texts for people. No I/O.
+"""The state as MAVLink messages for an autopilot's estimator and for a ground station, and texts. No I/O.
 
-Positions are relative to a fixed origin. North and east are metres on the map that the receiver itself uses to convert
-metres back to latitude and longitude: ArduPilot's and PX4's spheres differ from the ellipsoid by up to 3 m per kilometre,
-and the receiver must end at the latitude and longitude of the state. Down is the difference of heights, not the third axis
-of a tangent plane, which at 10 km is off by 8 m. Velocity and attitude are in north-east-down at the vehicle.
+Positions are relative to a fixed origin. North and east are metres in the projection that the receiver itself uses to
+convert metres back to latitude and longitude: ArduPilot's and PX4's spheres differ from the ellipsoid by up to 3 m per
+kilometre, and the receiver must get the latitude and longitude of the state. Down is the difference of heights, not the
+third axis of a tangent plane, which at 10 km is off by 8 m. Velocity and attitude are in north-east-down at the vehicle.
 `fusiond.messages.local_frame` has the tangent plane.
 
 Angles in covariances are small errors of roll, pitch and yaw, as MAVLink defines them, not rotations about north, east,
@@ -28,14 +28,14 @@ from fusiond.estimator.solution import Mode
 from fusiond.maths.rotation import matrix
 from fusiond.maths.wgs84 import normal_gravity, radii
 from fusiond.messages.types import Block, State, StateMessage
-from fusiond.units import MICROSECOND, MILLISECOND
+from fusiond.units import MICROSECOND, MILLISECOND, SECOND
 
 Array = NDArray[np.float64]
 
 ARDUPILOT_M_PER_DEG = 0.011131884502145034e7  # LOCATION_SCALING_FACTOR, Location.h
-ARDUPILOT_LEAST_SCALE = 0.01  # Location::longitude_scale
+ARDUPILOT_MIN_SCALE = 0.01  # Location::longitude_scale
 PX4_EARTH_RADIUS = 6_371_000.0  # m, CONSTANTS_RADIUS_OF_EARTH, geo.h
-STEEPEST_COSINE = 0.1  # of pitch: roll and yaw lose their meaning beyond 84 degrees
+MIN_PITCH_COSINE = 0.1  # of pitch: roll and yaw lose their meaning beyond 84 degrees
 GPS_EPOCH_S = 315_964_800  # Unix time of GPS time 0
 LEAP_SECONDS = 18  # GPS time less UTC, since 2017
 WEEK_MS = 7 * 24 * 3600 * 1000
@@ -45,7 +45,7 @@ TEXT_BYTES = 50  # of STATUSTEXT
 
 
 class Origin(NamedTuple):
-    """Where the local frame begins."""
+    """Origin of the local frame."""
 
     latitude_deg: float
     longitude_deg: float
@@ -57,19 +57,19 @@ class Origin(NamedTuple):
         return cls(state.lat_deg, state.lon_deg, state.height_m)
 
 
-Map = Callable[[Origin, float, float], tuple[float, float]]
+Projection = Callable[[Origin, float, float], tuple[float, float]]
 """Metres north and east of an origin, of latitude and longitude [deg]."""
 
 
-def ardupilot_map(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-    """ArduPilot's (Location::get_distance_NE, offset_latlng)."""
+def ardupilot_projection(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+    """ArduPilot's projection (Location::get_distance_NE, offset_latlng)."""
     middle = math.radians((latitude_deg + origin.latitude_deg) / 2)
-    scale = max(math.cos(middle), ARDUPILOT_LEAST_SCALE)
+    scale = max(math.cos(middle), ARDUPILOT_MIN_SCALE)
     east_deg = _half_turn(longitude_deg - origin.longitude_deg)
     return (latitude_deg - origin.latitude_deg) * ARDUPILOT_M_PER_DEG, east_deg * ARDUPILOT_M_PER_DEG * scale
 
 
-def px4_map(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+def px4_projection(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
     """PX4's azimuthal equidistant projection (MapProjection::project, geo.cpp)."""
     latitude, origin_latitude = math.radians(latitude_deg), math.radians(origin.latitude_deg)
     turn = math.radians(longitude_deg - origin.longitude_deg)
@@ -81,7 +81,7 @@ def px4_map(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[
     return north * stretch, east * stretch
 
 
-def ellipsoid_map(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+def ellipsoid_projection(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
     """True metres along meridian and parallel, by the radii of WGS-84 half way."""
     middle = math.radians((latitude_deg + origin.latitude_deg) / 2)
     meridian, transverse = radii(middle)
@@ -90,53 +90,53 @@ def ellipsoid_map(origin: Origin, latitude_deg: float, longitude_deg: float) -> 
     return north, east * math.cos(middle)
 
 
-def local_position(state: State, origin: Origin, on: Map) -> tuple[float, float, float]:
+def local_position(state: State, origin: Origin, project: Projection) -> tuple[float, float, float]:
     """North, east, down [m] from the origin."""
-    return (*on(origin, state.lat_deg, state.lon_deg), origin.height_m - state.height_m)
+    return (*project(origin, state.lat_deg, state.lon_deg), origin.height_m - state.height_m)
 
 
 # --- For an autopilot
 
 
-class Form(NamedTuple):
-    """How one kind of autopilot wants its messages."""
+class Conventions(NamedTuple):
+    """What one kind of autopilot expects of its messages."""
 
     local_frame: int  # MAV_FRAME of ODOMETRY's pose: the axes are north, east, down in either
-    on: Map
+    project: Projection
 
 
-FORMS = {
+CONVENTIONS = {
     # any other pair of frames is dropped silently (GCS_Common.cpp, handle_odometry)
-    "ardupilot": Form(common.MAV_FRAME_LOCAL_FRD, ardupilot_map),
-    # LOCAL_FRD is taken as well, but as a frame of arbitrary heading (mavlink_receiver.cpp, VehicleOdometry.msg)
-    "px4": Form(common.MAV_FRAME_LOCAL_NED, px4_map),
+    "ardupilot": Conventions(common.MAV_FRAME_LOCAL_FRD, ardupilot_projection),
+    # LOCAL_FRD is accepted too, but as a frame of arbitrary heading (mavlink_receiver.cpp, VehicleOdometry.msg)
+    "px4": Conventions(common.MAV_FRAME_LOCAL_NED, px4_projection),
 }
 
 
-def odometry(message: StateMessage, state: State, origin: Origin, form: Form, quality: int) -> Any:
+def odometry(message: StateMessage, state: State, origin: Origin, conventions: Conventions, quality: int) -> Any:
     """ODOMETRY: pose in the local frame, velocity and angular rate in body axes. `quality` is 1 to 100."""
     mat_nb = matrix(np.array(state.quaternion_nb))
     twist = mat_nb.T @ _square(state.covariance_velocity_m2ps2) @ mat_nb
-    rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # no more is known of them
+    rates = np.diag(np.square(state.sigma_gyro_bias_rps))  # nothing more is known about them
     return common.MAVLink_odometry_message(
-        message.t_ns // MICROSECOND, form.local_frame, common.MAV_FRAME_BODY_FRD,
-        *local_position(state, origin, form.on), list(state.quaternion_nb),
+        message.t_ns // MICROSECOND, conventions.local_frame, common.MAV_FRAME_BODY_FRD,
+        *local_position(state, origin, conventions.project), list(state.quaternion_nb),
         *(mat_nb.T @ state.velocity_ned_mps).tolist(), *state.angular_rate_b_rps,
         _upper(_square(state.covariance_position_m2), _euler_covariance(state)), _upper(twist, rates),
         message.resets & 0xFF, common.MAV_ESTIMATOR_TYPE_VIO, quality)  # fmt: skip
 
 
-def vision_position(message: StateMessage, state: State, origin: Origin, form: Form) -> Any:
+def vision_position(message: StateMessage, state: State, origin: Origin, conventions: Conventions) -> Any:
     """VISION_POSITION_ESTIMATE."""
     covariance = _upper(_square(state.covariance_position_m2), _euler_covariance(state))
     return common.MAVLink_vision_position_estimate_message(
-        message.t_ns // MICROSECOND, *local_position(state, origin, form.on), *_euler(state), covariance,
+        message.t_ns // MICROSECOND, *local_position(state, origin, conventions.project), *_euler(state), covariance,
         message.resets & 0xFF,
     )
 
 
 def gps_input(message: StateMessage, state: State, geoid_m: float, gps_id: int) -> Any:
-    """GPS_INPUT, as of a receiver with two antennas. Its dilutions of precision are the sigmas of position, at 1 m each."""
+    """GPS_INPUT of a receiver with two antennas. Its dilutions of precision are the sigmas of position, at 1 m each."""
     week, week_ms = divmod(message.t_ns // MILLISECOND + (LEAP_SECONDS - GPS_EPOCH_S) * 1000, WEEK_MS)
     north, east, down = state.sigma_position_ned_m
     horizontal = max(north, east)
@@ -178,7 +178,7 @@ def local_position_ned(message: StateMessage, state: State, origin: Origin) -> A
     bias = mat_nb @ np.diag(np.square(state.sigma_accel_bias_mps2)) @ mat_nb.T
     blocks = (_square(state.covariance_position_m2), _square(state.covariance_velocity_m2ps2), bias)
     return common.MAVLink_local_position_ned_cov_message(
-        message.t_ns // MICROSECOND, common.MAV_ESTIMATOR_TYPE_GPS_INS, *local_position(state, origin, ellipsoid_map),
+        message.t_ns // MICROSECOND, common.MAV_ESTIMATOR_TYPE_GPS_INS, *local_position(state, origin, ellipsoid_projection),
         *state.velocity_ned_mps, *acceleration_n.tolist(), _upper(*blocks))  # fmt: skip
 
 
@@ -215,7 +215,7 @@ def estimator_status(message: StateMessage, ratios: Ratios) -> Any:
 
 
 def marker(message: StateMessage, state: State, origin: Origin, geoid_m: float) -> Any:
-    """GLOBAL_POSITION_INT. Only ever under a system id of its own: under the vehicle's it would be taken for the
+    """GLOBAL_POSITION_INT. Only for a system id of its own: with the vehicle's it would be mistaken for the
     autopilot's."""
     velocity = [round(component * 100) for component in state.velocity_ned_mps]
     return common.MAVLink_global_position_int_message(
@@ -227,7 +227,7 @@ def marker(message: StateMessage, state: State, origin: Origin, geoid_m: float) 
 def status_texts(severity: int, text: str, number: int) -> Iterator[Any]:
     """STATUSTEXT, in as many chunks as needed. `number`, from 1 to 65535, marks the chunks of one text.
 
-    A chunk with a zero in it is the last: where the text fills all of them, an empty one follows.
+    A chunk with a zero in it is the last. If the text fills all chunks, an empty one follows.
     """
     data = text.encode("ascii", "replace")
     if len(data) <= TEXT_BYTES:
@@ -240,11 +240,11 @@ def status_texts(severity: int, text: str, number: int) -> Iterator[Any]:
 # --- Numbers
 
 
-class Pace:
-    """Thins messages to a rate, by their stamps."""
+class RateLimiter:
+    """Limits messages to a rate, by their stamps."""
 
     def __init__(self, rate_hz: float) -> None:
-        """0: none."""
+        """A rate of 0 lets no message through."""
         self.rate_hz = rate_hz
         self._due_ns: int | None = None
 
@@ -252,7 +252,7 @@ class Pace:
         """Whether a message is due at this instant; if so, it counts as sent."""
         if self.rate_hz <= 0 or (self._due_ns is not None and t_ns < self._due_ns):
             return False
-        period = round(1e9 / self.rate_hz)
+        period = round(SECOND / self.rate_hz)
         late = self._due_ns is None or t_ns - self._due_ns > period
         self._due_ns = (t_ns if late or self._due_ns is None else self._due_ns) + period
         return True
@@ -265,7 +265,7 @@ def _euler(state: State) -> tuple[float, float, float]:
 def _euler_covariance(state: State) -> Array:
     """Covariance (3, 3) of roll, pitch and yaw [rad^2] from that of small rotations about north, east, down."""
     _, pitch, yaw = _euler(state)
-    cosine = max(math.cos(pitch), STEEPEST_COSINE)
+    cosine = max(math.cos(pitch), MIN_PITCH_COSINE)
     sine_yaw, cosine_yaw, sine_pitch = math.sin(yaw), math.cos(yaw), math.sin(pitch)
     roll = (cosine_yaw / cosine, sine_yaw / cosine, 0.0)
     jacobian = np.array([roll, (-sine_yaw, cosine_yaw, 0.0), (roll[0] * sine_pitch, roll[1] * sine_pitch, 1.0)])

@@ -1,4 +1,4 @@
-"""The sensors of an autopilot: the fields of each MAVLink message that carries one, to events. No I/O."""
+"""The sensors of an autopilot: from the fields of MAVLink messages to events. No I/O."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from fusiond.events import (
     Vector3,
     WheelSpeed,
 )
+from fusiond.units import MILLISECOND, SECOND
 
-SECOND = 1_000_000_000  # ns
 MILLI_G = 9.80665e-3  # m/s^2
 UNKNOWN_U16 = 65535
 NORTH = 36000  # centidegrees: a yaw of 0
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
-SHORTEST_NS = 2_000_000  # a message that repeats the one before sooner than this is a copy of it
-LONGEST_NS = SECOND  # the mean speed over a longer interval says little about the speed at its middle
-RESET_M = 1.0  # a counter that falls to exactly 0 from farther off has been reset
+MIN_INTERVAL_NS = 2 * MILLISECOND  # a message that repeats the previous one sooner than this is a copy of it
+MAX_INTERVAL_NS = SECOND  # the mean speed over a longer interval says little about the speed at its middle
+RESET_M = 1.0  # a counter that falls to exactly 0 from more than this has been reset
 PASCAL = 100.0  # in a hectopascal
 FREEZING = 273.15  # K
-COLDEST, HOTTEST = 180.0, 400.0  # K, of a sensor that works
+MIN_TEMPERATURE, MAX_TEMPERATURE = 180.0, 400.0  # K, of a sensor that works
 MIN_PRESSURE, MAX_PRESSURE = 1_000.0, 120_000.0  # Pa: 31 km up, below the Dead Sea
 
 _AXES = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro")
@@ -43,7 +43,7 @@ Stamp = tuple[str, int | None]  # clock, stamp [ns]
 
 
 class Decoder(Protocol):
-    """What a handler needs of `MavlinkDecoder`."""
+    """The part of `MavlinkDecoder` that a handler needs."""
 
     counts: dict[str, int]
 
@@ -52,11 +52,11 @@ class Decoder(Protocol):
 
 
 class Handler(Protocol):
-    """What makes events of the messages of one sensor: `take` gets the `fields` in this order, and the receive stamp."""
+    """Makes events of the messages of one sensor: `events` gets the `fields` in this order, and the receive stamp."""
 
     @property
     def fields(self) -> tuple[str, ...]: ...
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]: ...
+    def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]: ...
 
 
 class ImuHandler:
@@ -68,9 +68,9 @@ class ImuHandler:
         self._mat_bs = _rotation(imu.rotation_deg) if any(imu.rotation_deg) else None  # sensor axes to body
         self._si = imu.message == "HIGHRES_IMU"
         self._limits = imu.accel_limit, imu.gyro_limit
-        self._stamp_us = 1 if imu.message in _IMU_STAMP else 1000  # microseconds in a unit of the stamp
+        self._stamp_us = 1 if imu.message in _IMU_STAMP else 1000  # unit of the stamp [us]
 
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+    def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         decoder = self._decoder
         if self._si and fields[8] != self._imu.instance:
             decoder.counts["other instances"] += 1
@@ -92,7 +92,7 @@ class ImuHandler:
             return Invalid(("beyond gyro_limit" if calm else "beyond accel_limit") if finite else "not finite")
         if self._mat_bs is None:
             return ImuSample(force, rate)
-        return ImuSample(_turn(self._mat_bs, force), _turn(self._mat_bs, rate))
+        return ImuSample(_rotated(self._mat_bs, force), _rotated(self._mat_bs, rate))
 
 
 class GnssHandler:
@@ -107,7 +107,7 @@ class GnssHandler:
         self._decoder, self._gnss = decoder, gnss
         self._position, self._velocity = f"{name}.position", f"{name}.velocity"
 
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+    def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         time_us, fix_type, lat, lon, alt, vel, cog, alt_ellipsoid, h_acc, v_acc, vel_acc = fields
         position: AnyPayload
         velocity: AnyPayload
@@ -134,8 +134,8 @@ class GnssHandler:
 class GnssYawHandler:
     """One [dual_antenna.NAME]: fields to GnssYaw.
 
-    By MAVLink 0 says that the receiver gives no yaw; PX4 sends it where there is none for the moment, too. It is counted
-    as invalid, so that a receiver that is not set up for yaw shows in the health.
+    In MAVLink 0 means that the receiver gives no yaw; PX4 also sends it when there is none for the moment. It is counted
+    as invalid, so that the health shows a receiver that is not set up for yaw.
     """
 
     fields = ("time_usec", "fix_type", "hdg_acc", "yaw")
@@ -143,7 +143,7 @@ class GnssYawHandler:
     def __init__(self, decoder: Decoder, name: str, antennas: DualAntenna, _config: Config) -> None:
         self._decoder, self._name, self._antennas = decoder, name, antennas
 
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+    def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         time_us, fix_type, accuracy, yaw = fields
         stamp = self._decoder.stamp(time_us) if self._antennas.stamp == "sensor" else ("", None)
         return [self._decoder.event(self._name, stamp, t_receive_ns, self._payload(fix_type, accuracy, yaw))]
@@ -164,7 +164,7 @@ class GnssYawHandler:
 class _Reading:
     clock: str
     raw_ns: int  # the message's stamp
-    t_ns: int  # that stamp, carried on by receipts where it stood still
+    t_ns: int  # that stamp; while it does not change, advanced by the receive stamps
     t_receive_ns: int
     distance: float  # m
 
@@ -172,8 +172,8 @@ class _Reading:
 class WheelHandler:
     """One [wheel.NAME] of WHEEL_DISTANCE: the mean speed between two messages, stamped at the middle between them.
 
-    An encoder's stamp may be that of its last pulse (ArduPilot), and so stand still with the wheel: then receipts say how
-    much time has passed. The first message, and one that repeats the one before at once, give no event.
+    An encoder's stamp may be that of its last pulse (ArduPilot). It does not change while the wheel stands still: then the
+    receive stamps give the elapsed time. The first message, and an immediate repeat of one, give no event.
     """
 
     fields = ("time_usec", "count", "distance")
@@ -183,7 +183,7 @@ class WheelHandler:
         self._fastest = config.filter.v_max_mps
         self._last: _Reading | None = None
 
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+    def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         time_us, count, *distances = fields
         clock, raw_ns = self._decoder.stamp(time_us)
         index = self._wheel.index
@@ -199,7 +199,7 @@ class WheelHandler:
             self._last = reading
             return []
         interval_ns = t_ns - last.t_ns
-        if abs(interval_ns) < SHORTEST_NS:
+        if abs(interval_ns) < MIN_INTERVAL_NS:
             return []
         self._last = reading
         middle_ns = t_ns if interval_ns < 0 else last.t_ns + interval_ns // 2
@@ -210,7 +210,7 @@ class WheelHandler:
         wheel = self._wheel
         if interval_ns < 0:
             return Invalid("clock went back")
-        if interval_ns > LONGEST_NS:
+        if interval_ns > MAX_INTERVAL_NS:
             return Invalid("gap")
         seconds = interval_ns / SECOND
         speed = (after - before) * wheel.scale / seconds
@@ -230,13 +230,13 @@ class PressureHandler:
     def __init__(self, decoder: Decoder, name: str, _barometer: Barometer, _config: Config) -> None:
         self._decoder, self._name = decoder, name
 
-    def take(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
+    def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         boot_ms, hectopascal, centi_celsius = fields
         absolute, temperature = hectopascal * PASCAL, centi_celsius / 100 + FREEZING
         payload: AnyPayload = Pressure(absolute, temperature)
         if not MIN_PRESSURE <= absolute <= MAX_PRESSURE:
             payload = Invalid("impossible pressure" if math.isfinite(absolute) else "not finite")
-        elif not COLDEST <= temperature <= HOTTEST:
+        elif not MIN_TEMPERATURE <= temperature <= MAX_TEMPERATURE:
             payload = Invalid("impossible temperature")
         return [self._decoder.event(self._name, self._decoder.stamp(boot_ms * 1000), t_receive_ns, payload)]
 
@@ -251,7 +251,7 @@ HANDLERS: dict[type[Sensor], Callable[[Decoder, str, Any, Config], Handler]] = {
 
 
 def _known(thousandths: int) -> float | None:
-    """An accuracy of the extension fields, mm or mm/s: 0 is unknown."""
+    """An accuracy of the extension fields [mm or mm/s]; 0 means unknown."""
     return thousandths / 1e3 if thousandths else None
 
 
@@ -262,7 +262,7 @@ def _within(vector: Vector3, limit: float) -> bool:
 
 
 def _rotation(angles_deg: Vector3) -> tuple[Vector3, Vector3, Vector3]:
-    """Rows of Rz(yaw) Ry(pitch) Rx(roll): it takes a vector in the sensor's axes to the body's."""
+    """The matrix Rz(yaw) Ry(pitch) Rx(roll), row by row: it rotates a vector from the sensor's axes to the body's."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in map(math.radians, angles_deg))
     return (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
@@ -271,7 +271,7 @@ def _rotation(angles_deg: Vector3) -> tuple[Vector3, Vector3, Vector3]:
     )
 
 
-def _turn(rows: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
+def _rotated(mat: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
     x, y, z = vector
-    (a, b, c), (d, e, f), (g, h, i) = rows
+    (a, b, c), (d, e, f), (g, h, i) = mat
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z

@@ -1,7 +1,7 @@
-"""MAVLink 2 signing: frames signed and checked with one key, and a timestamp that never falls, not even over a restart.
+"""MAVLink 2 signing: frames signed and checked with one key, and a timestamp that never decreases, not even after a restart.
 
-Timestamps count 10 us since 2015. The one on disk is ahead of those sent: it is rewritten, a minute ahead, before it is
-reached. So a start after a crash, or with a wall clock that was set back, begins after everything sent before.
+Timestamps count 10 us since 2015. The one on disk is ahead of those sent: before it is reached, one that is a minute ahead
+is written. So after a crash, or with a wall clock that was set back, fusiond continues after everything sent before.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SIGNATURE_SIZE, DIGEST_SIZE = 13, 6  # bytes: link, timestamp (6), digest (6)
 EPOCH_NS = 1_420_070_400 * SECOND  # 2015
 TICK_NS = 10_000
 MINUTE = 60 * SECOND // TICK_NS  # in timestamps
-LONGEST_FILE = 100  # characters of a timestamp file
+MAX_FILE_CHARACTERS = 100  # characters of a timestamp file
 
 
 class Signing:
@@ -34,22 +34,22 @@ class Signing:
         assert settings.signing_key_file is not None and settings.signing_timestamp_file is not None
         self._key = _read_key(config.path(settings.signing_key_file), f"mavlink.{link}.signing_key_file")
         self._file = config.path(settings.signing_timestamp_file)
-        self._last = self._kept = _read_timestamp(self._file, f"mavlink.{link}.signing_timestamp_file")
+        self._last = self._stored = _read_timestamp(self._file, f"mavlink.{link}.signing_timestamp_file")
         self._accept_unsigned = settings.accept_unsigned
         self._streams: dict[tuple[int, int, int], int] = {}  # by link id, system and component: the latest timestamp
         self.counts = {"unsigned": 0, "wrongly signed": 0, "timestamp not kept": 0}
 
-    def prepare(self, voice: Any) -> None:
+    def prepare(self, sender: Any) -> None:
         """Make a pymavlink MAVLink sign the next message it packs."""
         self._last = max(self._last + 1, _now())
-        if self._last > self._kept:
-            self._keep(self._last + MINUTE)
-        voice.signing.secret_key = self._key
-        voice.signing.sign_outgoing = True
-        voice.signing.timestamp = self._last
+        if self._last > self._stored:
+            self._store(self._last + MINUTE)
+        sender.signing.secret_key = self._key
+        sender.signing.sign_outgoing = True
+        sender.signing.timestamp = self._last
 
     def accepts(self, frame: bytes) -> bool:
-        """Whether a frame is signed with the key and newer than those before it, or may be unsigned. Counts the others."""
+        """Whether a frame is signed with the key and newer than those before it, or may be unsigned. Others are counted."""
         if frame[0] != MAGIC_2 or not frame[2] & SIGNED:
             self.counts["unsigned"] += not self._accept_unsigned
             return self._accept_unsigned
@@ -71,8 +71,8 @@ class Signing:
         self._streams[stream] = timestamp
         return True
 
-    def _keep(self, timestamp: int) -> None:
-        """Write the timestamp that a restart begins from, atomically."""
+    def _store(self, timestamp: int) -> None:
+        """Write, atomically, the timestamp that a restart continues from."""
         new = self._file.with_name(self._file.name + ".new")
         try:
             with new.open("w", encoding="ascii") as file:
@@ -82,7 +82,7 @@ class Signing:
             new.replace(self._file)
         except OSError:
             self.counts["timestamp not kept"] += 1  # the disk is full or read-only: sending must go on
-        self._kept = timestamp
+        self._stored = timestamp
 
 
 def _now() -> int:
@@ -101,20 +101,20 @@ def _read_key(path: Path, key: str) -> bytes:
     except ValueError:
         secret = b""
     if len(secret) != KEY_SIZE:
-        raise ConfigError(f"{key}: {path}: {KEY_SIZE} bytes, or {2 * KEY_SIZE} hex digits, are wanted")
+        raise ConfigError(f"{key}: {path}: {KEY_SIZE} bytes, or {2 * KEY_SIZE} hex digits, are needed")
     return secret
 
 
 def _read_timestamp(path: Path, key: str) -> int:
-    """The timestamp kept; 0 where there is no file yet."""
+    """The stored timestamp; 0 if there is no file yet."""
     if not path.parent.is_dir():
         raise ConfigError(f"{key}: no such folder: {path.parent}")
     try:
-        text = path.read_text(encoding="ascii")[:LONGEST_FILE]
+        text = path.read_text(encoding="ascii")[:MAX_FILE_CHARACTERS]
     except FileNotFoundError:
         return 0
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{key}: {path}: cannot be read: {error}") from error
     if not text.strip().isdecimal():
-        raise ConfigError(f"{key}: {path}: holds no timestamp; remove it to begin anew")
+        raise ConfigError(f"{key}: {path}: holds no timestamp; remove it to start again")
     return int(text)

@@ -1,14 +1,14 @@
-"""Byte transports of MAVLink links, by pymavlink's connection strings. They print nothing, and every loss is noticed.
+"""Byte transports of MAVLink links, by pymavlink's connection strings. They print nothing and detect every loss.
 
-    udpin:HOST:PORT     listen; answers go to every peer heard within the last minute (udp:HOST:PORT is the same)
-    udpout:HOST:PORT    send there first, hear what comes back
-    udpbcast:HOST:PORT  likewise, to a broadcast address
+    udpin:HOST:PORT     listen; replies go to every peer that sent within the last minute (udp:HOST:PORT is the same)
+    udpout:HOST:PORT    send there first, receive the replies
+    udpbcast:HOST:PORT  the same, to a broadcast address
     tcp:HOST:PORT       connect
-    tcpin:HOST:PORT     listen; the latest to connect is the peer
+    tcpin:HOST:PORT     listen; the peer is the latest to connect
     uds:PATH            connect to a Unix domain socket (unix:PATH is the same)
     DEVICE[,BAUD]       a serial line
 
-pymavlink's own classes print, sleep, mistake the end of a stream for silence and swallow errors.
+pymavlink's own classes print, sleep, mistake the end of a stream for a pause and swallow errors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import serial
 
 CHUNK = 65536  # bytes read at a time; no UDP datagram is longer
 CONNECT_TIMEOUT_S = 5.0
-FORGET_S = 60.0  # a UDP peer that is silent for this long gets no more answers
+FORGET_S = 60.0  # a UDP peer that sends nothing for this long gets no more replies
 MAX_PEERS = 16
 
 
@@ -62,7 +62,7 @@ def opener(connection: str, baud: int) -> Callable[[], Transport]:
 def _address(connection: str, rest: str) -> tuple[str, int]:
     host, _, port = rest.rpartition(":")
     if not host or not port.isdecimal() or not 0 <= int(port) <= 65535:
-        raise ValueError(f"'{connection}': HOST:PORT is wanted after the first colon")
+        raise ValueError(f"'{connection}': HOST:PORT is needed after the first colon")
     return host, int(port)
 
 
@@ -76,16 +76,16 @@ def _unix_socket(path: str) -> socket.socket:
     return made
 
 
-class Whole:
-    """Frames on a line that may take only a part of one: the rest is sent first the next time, so frames stay whole."""
+class WholeFrames:
+    """Frames written to a line that may accept only part of one: the rest is sent first the next time."""
 
     def __init__(self, write: Callable[[bytes], int]) -> None:
-        """`write` gives how many bytes the line took. It may raise BlockingIOError: none."""
+        """`write` returns the number of bytes accepted, or raises BlockingIOError if there is no room."""
         self._write = write
         self._rest = b""
 
     def put(self, data: bytes) -> bool:
-        """Write a frame. Whether it was taken."""
+        """Write a frame. Whether it was accepted."""
         try:
             if self._rest:
                 self._rest = self._rest[self._write(self._rest) :]
@@ -116,7 +116,7 @@ class _Udp:
                     found.append(self.socket.recvfrom(CHUNK))
             except BlockingIOError:
                 return found
-            except ConnectionRefusedError:  # nobody listens there yet
+            except ConnectionRefusedError:  # no one listens there yet
                 return found
         return found
 
@@ -124,7 +124,7 @@ class _Udp:
         try:
             self.socket.sendto(data, address)
         except (BlockingIOError, ConnectionRefusedError):
-            return False  # a full buffer, or nobody listens there yet: a datagram is lost, as datagrams may be
+            return False  # the buffer is full, or no one listens there yet: the datagram is lost
         return True
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ class _Udp:
 class _UdpIn(_Udp):
     def __init__(self, address: tuple[str, int]) -> None:
         super().__init__()
-        self._peers: dict[tuple[str, int], float] = {}  # when each was last heard, monotonic [s]
+        self._peers: dict[tuple[str, int], float] = {}  # when each last sent, monotonic [s]
         try:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self.socket.bind(address)
@@ -152,10 +152,10 @@ class _UdpIn(_Udp):
 
     def write(self, data: bytes) -> bool:
         now = time.monotonic()
-        peers = list(self._peers.items())  # at once: the reading thread adds to them
-        for peer in [peer for peer, heard in peers if now - heard >= FORGET_S]:
+        peers = list(self._peers.items())  # a copy: the reading thread adds to them
+        for peer in [peer for peer, last in peers if now - last >= FORGET_S]:
             self._peers.pop(peer, None)
-        return sum(self.send(data, peer) for peer, heard in peers if now - heard < FORGET_S) > 0
+        return sum(self.send(data, peer) for peer, last in peers if now - last < FORGET_S) > 0
 
 
 class _UdpOut(_Udp):
@@ -184,7 +184,7 @@ class _Stream:
         connected.setblocking(False)
         if connected.family != socket.AF_UNIX:
             connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._out = Whole(connected.send)
+        self._out = WholeFrames(connected.send)
 
     def read(self, timeout_s: float) -> list[bytes]:
         if not _wait([self.socket], timeout_s):
@@ -202,8 +202,8 @@ class _Stream:
 
 
 class _TcpIn:
-    """A listening socket and its latest peer. When the peer goes, it waits for the next; only the loss of the listener is
-    an error."""
+    """A listening socket and its latest peer. When the peer disconnects, it waits for the next. Only the loss of the
+    listener is an error."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._listener = socket.create_server(address, backlog=1)
@@ -230,7 +230,7 @@ class _TcpIn:
             try:
                 return self._peer is not None and self._peer.write(data)
             except OSError:
-                return False  # the reading thread finds the peer gone
+                return False  # the reading thread detects the loss
 
     def _follow(self, peer: _Stream | None) -> None:
         with self._changing:
@@ -246,7 +246,7 @@ class _TcpIn:
 class _Serial:
     def __init__(self, device: str, baud: int) -> None:
         self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
-        self._out = Whole(lambda data: os.write(self._port.fileno(), data))  # pyserial's own spins on a full line
+        self._out = WholeFrames(lambda data: os.write(self._port.fileno(), data))  # pyserial's own spins on a full line
 
     def read(self, timeout_s: float) -> list[bytes]:
         ready, _, _ = select.select([self._port], [], [], timeout_s)

@@ -16,7 +16,7 @@ from fusiond.config.outputs import Zenoh as ZenohSection
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.messages.types import HealthMessage, Message, StateMessage
-from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.zenoh.session import PublishError, open_session
 
 try:
@@ -104,6 +104,6 @@ def _connected(session: zenoh.Session) -> bool:
     return bool(session.info.routers_zid() or session.info.peers_zid())
 
 
-def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
     """The output of a configuration."""
     return [Ros2Output(config)]

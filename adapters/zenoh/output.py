@@ -16,7 +16,7 @@ import zenoh
 
 from fusiond.config.schema import Config
 from fusiond.messages.types import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant, StateMessage
-from fusiond.ports.outputs import POLL_S, Around, LiveOutput, Outbox, OutputLost
+from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.zenoh.queries import Answers
 from fusiond_adapters.zenoh.session import TELL_LAST_S, PublishError, ZenohPublisher, open_session
 
@@ -117,6 +117,6 @@ class ZenohOutput:
         return self._notes
 
 
-def make(config: Config, _: Around) -> Sequence[LiveOutput]:
+def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
     """The output of a configuration."""
     return [ZenohOutput(config)]

@@ -1,4 +1,4 @@
-"""For those who read fusiond: subscribe to a vehicle's messages over Zenoh, with their types, and ask for what was.
+"""The client for programs that read fusiond: typed messages of a vehicle over Zenoh, subscribed or queried.
 
     from fusiond.app.client import Client
     from fusiond.messages.types import StateMessage
@@ -7,7 +7,7 @@
         for message in client.stream(StateMessage, timeout_s=2.0):
             print(message.t_ns, message.mode, message.state and message.state.lat_deg)
 
-Callbacks run in a thread of Zenoh's; what is slow belongs elsewhere. All else may be called from any thread.
+Callbacks run in a thread of Zenoh: slow work belongs elsewhere. Everything else may be called from any thread.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from fusiond.ports.outputs import Outbox
 from fusiond_adapters.zenoh.session import CONTENT_TYPES, KIND, STREAMS, PublishError, alive_key, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-STREAM_MESSAGES = 1024  # kept for a slow reader of a stream; of more the oldest are dropped
+STREAM_MESSAGES = 1024  # kept for a slow reader of a stream; the oldest are dropped
 ENCODINGS: dict[str, Encoding] = {content_type: encoding for encoding, content_type in CONTENT_TYPES.items()}
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 
 class ClientError(Exception):
-    """fusiond cannot be reached, or does not answer as asked; the message says why."""
+    """fusiond cannot be reached, or does not answer; the message says why."""
 
 
 class Client:
     """A connection to the fusiond of one vehicle (or of all: `vehicle="*"`), directly or through a router.
 
-    `config_file` is Zenoh's own configuration, for TLS and the like. Raises ClientError where nobody can be reached.
+    `config_file` is Zenoh's own configuration file, such as for TLS. Raises ClientError if the endpoint cannot be reached.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Client:
         timeout_s: float = 5.0,
     ) -> None:
         self.vehicle = vehicle
-        self.undecodable = 0  # samples that were no such message
+        self.undecodable = 0  # samples that could not be decoded
         self._timeout_s = timeout_s
         file = None if config_file is None else str(Path(config_file).absolute())
         section = ZenohSection(mode="client", listen=[], connect=[endpoint], config_file=file)
@@ -65,14 +65,14 @@ class Client:
         except PublishError as error:
             raise ClientError(str(error)) from error
 
-    # --- As it comes
+    # --- Subscriptions
 
     @contextmanager
     def subscribed(self, kind: type[AnyMessage], callback: Callable[[AnyMessage], None]) -> Iterator[None]:
         """Inside the block, `callback` gets every message of a kind.
 
-        Health, events, info and config come with the latest one at once, and what was missed is fetched again; a state,
-        settled state or innovation that a slow network loses stays lost.
+        For health, events, info and config the latest message comes at once, and missed ones are fetched again. A state,
+        settled state or innovation that is lost on a slow network is not.
         """
         name = KIND[kind]
         where = key(self.vehicle, name, "*" if kind is InnovationMessage else "")
@@ -97,43 +97,43 @@ class Client:
             yield
 
     def stream(self, kind: type[AnyMessage], timeout_s: float) -> Iterator[AnyMessage]:
-        """The messages of a kind as they come. Raises TimeoutError when none has come for so long."""
+        """The messages of a kind as they come. Raises TimeoutError when none comes within `timeout_s`."""
         outbox = Outbox(STREAM_MESSAGES, (kind,))
         with self.subscribed(kind, outbox.put):
             while messages := outbox.take(timeout_s):
-                yield from cast(list[AnyMessage], messages)  # the outbox lets in no other kind
+                yield from cast(list[AnyMessage], messages)  # the outbox accepts no other kind
         raise TimeoutError(f"no {KIND[kind]} of {self.vehicle} for {timeout_s:g} s")
 
-    # --- On demand
+    # --- Queries
 
     def latest(self, kind: type[AnyMessage]) -> AnyMessage:
         """The latest message of a kind. Raises ClientError."""
         return self._ask(kind, "")
 
     def state_at(self, t_ns: int) -> StateMessage:
-        """The state published nearest to an instant within the horizon. Raises ClientError."""
+        """The published state nearest to an instant within the horizon. Raises ClientError."""
         return self._ask(StateMessage, f"?t_ns={t_ns}")
 
     def health(self) -> HealthMessage:
-        """How everything is. Raises ClientError."""
+        """The latest health. Raises ClientError."""
         return self.latest(HealthMessage)
 
     def info(self) -> InfoMessage:
-        """What is running there. Raises ClientError."""
+        """Version, configuration and keys of the running fusiond. Raises ClientError."""
         return self.latest(InfoMessage)
 
     def config(self) -> ConfigMessage:
-        """The configuration in force there. Raises ClientError."""
+        """The configuration in force. Raises ClientError."""
         return self.latest(ConfigMessage)
 
     def alive(self) -> frozenset[str]:
-        """The vehicles whose fusiond is there, of those asked for."""
+        """The vehicles with a running fusiond, of those that the client is for."""
         replies = self._session.liveliness().get(alive_key(self.vehicle), timeout=self._timeout_s)
         return frozenset(str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None)
 
     def _ask(self, kind: type[AnyMessage], parameters: str) -> AnyMessage:
         where = key(self.vehicle, KIND[kind], "*" if kind is InnovationMessage else "")
-        refusal = "nobody answers"
+        refusal = "no answer"
         for reply in self._session.get(where + parameters, timeout=self._timeout_s):
             if reply.ok is not None:
                 message = self._decoded(reply.ok, kind)
@@ -150,11 +150,11 @@ class Client:
             try:
                 return decode(sample.payload.to_bytes(), kind, encoding)
             except msgspec.DecodeError:
-                pass  # counted below, with what has another content type
+                pass  # counted below, with other content types
         self.undecodable += 1
         return None
 
-    # --- Its end
+    # --- End
 
     def close(self) -> None:
         """End the connection. Closing twice does nothing."""

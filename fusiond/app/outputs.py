@@ -1,8 +1,8 @@
-"""The fan-out: every message of a run, to every output of it. A live run and a replay each own one.
+"""The fan-out: every message of a run to all of its outputs. A live run and a replay each own one.
 
-Each output sends in a thread of its own, from its outbox, and is opened again when it is lost. In a live run nothing
-waits for it: a full outbox drops its oldest message, and counts it. A replay has patience: it waits for room, for a time.
-The end is orderly: after `stop` each output sends what is left, and ends.
+Each output sends from its outbox in a thread of its own, and is opened again when it is lost. In a live run nothing waits
+for it: a full outbox drops its oldest message and counts it. A replay waits for room, up to a limit. After `stop` each
+output sends the rest of its outbox and ends.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ log = logging.getLogger("fusiond")
 class Outputs(Mapping[str, LiveOutput]):
     """The outputs of one run, by name.
 
-    `now` reads the time line of the stamps. `introduction` makes the messages that are sent once, whenever an output has
-    been opened. `max_pause_s` limits the pauses before one that was lost is opened again. `patience_s` is how long a message
-    may wait for room in an outbox: 0 in a live run.
+    `now` reads the clock of the stamps. `introduction` makes the messages that are sent once, whenever an output has been
+    opened. `max_pause_s` limits the pauses before a lost output is opened again. `patience_s` is how long a message may wait
+    for room in an outbox: 0 in a live run.
     """
 
     def __init__(
@@ -35,8 +35,8 @@ class Outputs(Mapping[str, LiveOutput]):
         max_pause_s: Callable[[], float],
         patience_s: float = 0.0,
     ) -> None:
-        self.handed_over = RecentLatencies()  # from the instant of a state to its having been put into every outbox
-        self.failures: dict[str, str] = {}  # why an output is not open now, by name
+        self.handed_over = RecentLatencies()  # from the instant of a state until it is in every outbox
+        self.failures: dict[str, str] = {}  # by name: why an output is not open
         self._outputs = {output.name: output for output in outputs}
         self._now, self._introduction, self._max_pause_s = now, introduction, max_pause_s
         self._stop = Event()
@@ -57,37 +57,37 @@ class Outputs(Mapping[str, LiveOutput]):
         return len(self._outputs)
 
     def put(self, message: Message) -> None:
-        """Leave a message with every output that wants its kind."""
+        """Put a message into the outbox of every output that accepts its kind."""
         for output in self._outputs.values():
             output.outbox.put(message)
         if isinstance(message, StateMessage):
             self.handed_over.add(max(0, self._now() - message.t_ns))
 
     def introduce(self) -> None:
-        """Send anew to all what is sent once."""
+        """Send the introduction to all outputs again."""
         for output in self._outputs.values():
             self._introduce(output)
 
-    # --- Their sessions
+    # --- Sessions
 
     def start(self) -> None:
-        """Open all of them, each in a thread of its own."""
+        """Open all outputs, each in a thread of its own."""
         for thread in self._threads:
             thread.start()
 
     def wait_until_tried(self) -> None:
-        """Wait until each is open, or could not be opened: see `failures`."""
+        """Wait until each output is open or could not be opened: see `failures`."""
         for event in self._tried.values():
             event.wait()
 
     def stop(self) -> None:
-        """There is no more to come. Each sends what it has, and ends. From any thread."""
+        """No more messages will come: each output sends the rest of its outbox and ends. From any thread."""
         self._stop.set()
         for output in self._outputs.values():
             output.outbox.rouse()
 
     def join(self) -> None:
-        """Wait for their end, after `stop`."""
+        """Wait until all have ended, after `stop`."""
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join()
@@ -117,10 +117,10 @@ class Outputs(Mapping[str, LiveOutput]):
         for message in self._introduction():
             output.outbox.put(message, may_wait=False)
 
-    # --- What became of the messages
+    # --- Counts
 
     def health(self) -> dict[str, OutputHealth]:
-        """As it is published."""
+        """The published health of each output."""
         return {
             name: OutputHealth(
                 offered=output.outbox.offered,
@@ -133,9 +133,9 @@ class Outputs(Mapping[str, LiveOutput]):
         }
 
     def dropped(self) -> dict[str, int]:
-        """Messages that found no room in an outbox, by output."""
+        """Messages dropped for lack of room, by output."""
         return {name: output.outbox.dropped for name, output in self._outputs.items()}
 
     def unsent(self) -> dict[str, int]:
-        """After the end: messages that were dropped, or are still in an outbox, by output."""
+        """After the end: messages that were dropped or are still in an outbox, by output."""
         return {name: output.outbox.dropped + output.outbox.waiting for name, output in self._outputs.items()}

@@ -1,4 +1,4 @@
-"""A progress bar on a terminal; nothing where the output is none."""
+"""A progress bar on a terminal; nothing if the output is not a terminal."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TextIO, TypeVar
 
+from fusiond.units import MILLISECOND, SECOND
+
 WIDTH = 30  # characters of the bar
-INTERVAL_NS = 100_000_000  # between two drawings
-STRIDE = 64  # events between two looks at the clock
+INTERVAL_NS = 100 * MILLISECOND  # between two drawings
+STRIDE = 64  # events between two readings of the clock
 
 Item = TypeVar("Item")
 
@@ -16,9 +18,9 @@ Item = TypeVar("Item")
 def shown(
     items: Iterable[Item], share: Callable[[], float], elapsed_ns: Callable[[], int], stream: TextIO
 ) -> Iterator[Item]:
-    """The same items, with a bar that tells how far they have come.
+    """The same items, with a bar that shows the progress.
 
-    `share` is the part done, 0 to 1; `elapsed_ns` the recorded time that has passed, for the pace.
+    `share` returns the part done, 0 to 1; `elapsed_ns` the recorded time that has passed, for the speed.
     """
     if not stream.isatty():
         yield from items
@@ -29,10 +31,10 @@ def shown(
             yield item
             if number % STRIDE == 0 and (now := time.monotonic_ns()) - drawn >= INTERVAL_NS:
                 drawn = now
-                stream.write("\r" + line(share(), elapsed_ns() / 1e9, (now - began) / 1e9))
+                stream.write("\r" + line(share(), elapsed_ns() / SECOND, (now - began) / SECOND))
                 stream.flush()
     finally:
-        stream.write("\r\x1b[K")  # leaves an empty line to whoever writes next
+        stream.write("\r\x1b[K")  # leaves an empty line
         stream.flush()
 
 

@@ -1,4 +1,4 @@
-"""The file of the stored state: read at the start, written in one piece or not at all, its failures counted."""
+"""The file of the stored state: read at the start, replaced atomically, failures counted."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from fusiond.filter.state import Verdict
 from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, to_text
 from fusiond.messages.types import OutputHealth
 
-MOST_BYTES = 1_000_000  # a larger file is none of ours
+MAX_BYTES = 1_000_000  # a larger file was not written by fusiond
 
 log = logging.getLogger("fusiond")
 
 
 def read_state(path: Path) -> StoredState | None:
-    """What the file holds; None where there is none yet. Raises StoredStateError."""
+    """The stored state in the file; None if there is no file yet. Raises StoredStateError."""
     try:
         with path.open("rb") as file:
-            text = file.read(MOST_BYTES + 1)
+            text = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise StoredStateError(f"cannot be read: {error.strerror}") from error
-    if len(text) > MOST_BYTES:
+    if len(text) > MAX_BYTES:
         raise StoredStateError("torn or altered: it is too large")
     return from_text(text)
 
 
 class StateFile:
-    """Reads what the last run left, and keeps the newest state on disk: whoever reads the file finds the old one or the new
-    one, whole."""
+    """Reads the stored state of the last run, and writes new ones. A reader of the file finds the old state or the new one,
+    never a part."""
 
     def __init__(self, path: Path, config: Config, now_ns: int) -> None:
-        self.stored: StoredState | None = None  # what the last run left, if it is of use
+        self.stored: StoredState | None = None  # of the last run, if it can be used
         self.written = self.lost = 0
-        self.error: str | None = None  # the last one, while it lasts
+        self.error: str | None = None  # the last one, until a write succeeds
         self._path = path
         self._cold = "there is none yet"
-        self._told = Verdict.NONE
+        self._logged = Verdict.NONE
         try:
             stored = read_state(path)
             if stored is not None:
@@ -52,16 +52,16 @@ class StateFile:
             log.warning("stored state ignored: %s: %s", path, error)
 
     def health(self, verdict: Verdict) -> OutputHealth:
-        """Writes and failures, and what became of the stored state; the log has one line when that is decided."""
+        """Counts of writes and failures, and the verdict on the stored state, which is logged once when it is decided."""
         about = WORDS[verdict] if self.stored else f"ignored: {self._cold}"
-        if verdict is not self._told:
-            self._told = verdict
+        if verdict is not self._logged:
+            self._logged = verdict
             log.info("stored state: %s", about)
         notes = {"hot_start": about} | ({"error": self.error} if self.error else {})
         return OutputHealth(offered=self.written + self.lost, dropped=self.lost, counts={}, notes=notes)
 
     def write(self, stored: StoredState) -> None:
-        """Replace the file, and see to it that this lasts. A failure is counted; the file then stays as it was."""
+        """Replace the file durably. A failure is counted, and leaves the file as it was."""
         try:
             self._replace(to_text(stored))
         except OSError as error:
@@ -85,6 +85,6 @@ class StateFile:
             raise
         folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            os.fsync(folder)  # the name, too, outlasts a power cut
+            os.fsync(folder)  # so that the new name survives a power failure
         finally:
             os.close(folder)

@@ -1,4 +1,4 @@
-"""The published messages, for every reader: their types, encodings and CSV rows. The modules say how they are made."""
+"""The published messages: their types, encodings and CSV rows, and how they are made."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def encode(message: Message, encoding: Encoding) -> bytes:
 
 
 def decode(data: bytes, kind: type[AnyMessage], encoding: Encoding) -> AnyMessage:
-    """The message in the bytes; fields it does not know are passed over. Raises msgspec.DecodeError."""
+    """The message in the bytes; unknown fields are ignored. Raises msgspec.DecodeError."""
     return msgspec.json.decode(data, type=kind) if encoding == "json" else msgspec.msgpack.decode(data, type=kind)
 
 

@@ -1,4 +1,4 @@
-"""The CSV file of states: its header, and the row of a message with the same numbers, bit for bit."""
+"""The CSV file of states: its header, and the line of a message. Numbers read back bit for bit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def csv_header() -> str:
 
 
 def csv_row(message: StateMessage) -> str:
-    """One line, without its end. Numbers are the shortest that read back as the same float; no state, empty cells."""
+    """One line, without its end. Numbers are the shortest that read back as the same float; no state: empty."""
     numbers = _csv_numbers(message.state) if message.state else [""] * (len(CSV_COLUMNS) - 2)
     return ",".join([str(message.t_ns // MICROSECOND), *numbers, message.mode.value])
 

@@ -1,4 +1,4 @@
-"""State messages made from an estimate: in the units of the message, and with finite numbers only."""
+"""State messages from an estimate, in the units of the message and with finite numbers only."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ AnyState = TypeVar("AnyState", bound=StateAtInstant)
 def state_message(estimate: Solution, vehicle: str, outcomes: OutcomeCounts) -> StateMessage:
     """The message of an estimate.
 
-    A state with a number that is not finite, or with a negative variance, is withheld: the message then has mode
-    `lost` and no state, and `fault` names the number. Publication goes on, and a reader sees why.
+    A state with a number that is not finite or with a negative variance is withheld: the message then has mode `lost` and
+    no state, and `fault` names the number. Publication continues, so a reader sees the reason.
     """
     return _message(StateMessage, estimate, vehicle, outcomes)
 
 
 def settled_message(estimate: Solution, vehicle: str, outcomes: OutcomeCounts) -> SettledMessage:
-    """The same of an estimate at the horizon."""
+    """The message of an estimate at the horizon."""
     return _message(SettledMessage, estimate, vehicle, outcomes)
 
 
@@ -52,7 +52,7 @@ def _message(kind: type[AnyState], estimate: Solution, vehicle: str, outcomes: O
 
 
 def _checked(estimate: SolutionState) -> tuple[State | None, str | None]:
-    """The published state, or None and what is wrong with it."""
+    """The state to publish, or None and its fault."""
     if not all(variance >= 0 for variance in estimate.covariance.diagonal().tolist()):
         return None, "covariance: a variance is negative or not a number"
     state = _published(estimate)
@@ -96,7 +96,7 @@ def _published(estimate: SolutionState) -> State:
     )
 
 
-# NumPy's scalars pass for floats, but msgspec refuses them and their repr is not a number's: hence float() below.
+# NumPy's scalars are floats, but msgspec refuses them and their repr is not a plain number: hence float() below.
 
 
 def _triple(vector: Triple) -> Triple:

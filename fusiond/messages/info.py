@@ -1,4 +1,4 @@
-"""Messages that stay the same while the daemon runs: what is running, and its configuration."""
+"""Messages that change only with a reload: what is running, and its configuration."""
 
 from __future__ import annotations
 

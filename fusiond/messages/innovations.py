@@ -1,8 +1,8 @@
-"""Innovations: how each measurement was judged, reported once, at the first tick after that.
+"""Innovations: innovation and outcome of each measurement, published once, at the first tick after they are known.
 
-The outcome is read at the tick, not at the receipt: to ask for it there would have the history run its rows again for
-every late measurement, where one run before the tick serves them all. Only where ticks are so rare that the history would
-forget a measurement before the next one, its row is read in time and kept here.
+The outcome is read at the tick, not at the receipt: reading it at the receipt would make the history run its rows again
+for every late measurement, where one run before the tick is enough for all of them. If ticks are so rare that the history
+would drop a measurement before the next one, its row is read earlier and kept here.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from fusiond.filter.rows import Outcome
 from fusiond.messages.outcomes import NAMES
 from fusiond.messages.types import InnovationMessage
 
-MAX_PENDING = 4096  # measurements that wait for the IMU; of more the oldest are reported as waiting
-MARGIN = 0.1  # a row is read, at the latest, this share of the horizon before the history may forget it
-AHEAD = 0.5  # and with it those that follow within this share, so that this is done seldom
+MAX_PENDING = 4096  # measurements that wait for the IMU; if there are more, the oldest are published as waiting
+MARGIN = 0.1  # a row is read at least this share of the horizon before the history may drop it
+AHEAD = 0.5  # together with those that follow within this share, so that it is done rarely
 NEVER_NS = 2**63 - 1
 
 Key = tuple[int, int, int]  # stamp, source, sequence
@@ -32,7 +32,7 @@ class _Row(NamedTuple):
 
 
 class Innovations:
-    """Measurements received, until each is judged. The IMU has none: it carries the state, it does not correct it."""
+    """Measurements received, until the outcome of each is known. IMU samples have none: they propagate the state."""
 
     def __init__(self, vehicle: str, fusion: Fusion) -> None:
         plan = fusion.plan
@@ -40,11 +40,11 @@ class Innovations:
         self._imu = plan.sources[plan.imu_source]
         self._margin_ns, self._ahead_ns = int(MARGIN * plan.horizon_ns), int(AHEAD * plan.horizon_ns)
         self._pending: list[Receipt] = []
-        self._read: dict[Key, _Row] = {}  # rows of pending measurements, as far as they had to be read already
-        self._unread_ns = NEVER_NS  # stamp of the oldest pending measurement whose row has not been read
+        self._read: dict[Key, _Row] = {}  # rows of pending measurements that had to be read early
+        self._unread_ns = NEVER_NS  # stamp of the oldest pending measurement whose row has not been read yet
 
     def add(self, receipt: Receipt) -> None:
-        """Take what was received, of any source."""
+        """Add a receipt of any source."""
         if receipt.measurement.source != self._imu:
             self._pending.append(receipt)
             if receipt.refusal is None:
@@ -52,8 +52,8 @@ class Innovations:
         if self._unread_ns < self._history.settled_ns + self._margin_ns:
             self._read_in_time()
 
-    def judged(self) -> list[InnovationMessage]:
-        """Those judged since the last time, in order of receipt."""
+    def published(self) -> list[InnovationMessage]:
+        """The messages whose outcome has become known since the last call, in order of receipt."""
         receipts, self._pending = self._pending, []
         rows = self._read | self._rows(receipts)
         self._read = {}
@@ -68,14 +68,14 @@ class Innovations:
         return found
 
     def _read_in_time(self) -> None:
-        """Read the rows of all that is pending. Those about to be forgotten will not change any more."""
+        """Read the rows of all pending measurements. Those about to be dropped will not change any more."""
         self._read |= self._rows(self._pending)
         until_ns = self._history.settled_ns + self._ahead_ns
         stamps = (one.measurement.t_ns for one in self._pending if one.refusal is None)
         self._unread_ns = min((t_ns for t_ns in stamps if t_ns > until_ns), default=NEVER_NS)
 
     def _rows(self, receipts: list[Receipt]) -> dict[Key, _Row]:
-        """What stands in the history of measurements that were received, as far as it is not forgotten there."""
+        """The rows of received measurements that are still in the history."""
         wanted = {self._key(one.measurement) for one in receipts if one.refusal is None}
         if not wanted:
             return {}
@@ -84,7 +84,7 @@ class Innovations:
         keys = zip(rows["t_ns"].tolist(), rows["source"].tolist(), rows["sequence"].tolist(), strict=True)
         columns = (rows[name].tolist() for name in ("outcome", "ratio", "innovation", "variance"))
         found = zip(keys, *columns, strict=True)
-        return {key: _Row(Outcome(outcome), *judgement) for key, outcome, *judgement in found if key in wanted}
+        return {key: _Row(Outcome(outcome), *values) for key, outcome, *values in found if key in wanted}
 
     def _key(self, measurement: Measurement) -> Key:
         return measurement.t_ns, self._history.index[measurement.source], measurement.sequence
@@ -94,7 +94,7 @@ class Innovations:
         ratio: float | None = None
         innovation: tuple[float, ...] = ()
         variance: tuple[float, ...] = ()
-        outcome = Outcome.WAITING if receipt.refusal is None else receipt.refusal  # without a row: it waited to the end
+        outcome = Outcome.WAITING if receipt.refusal is None else receipt.refusal  # without a row it is still waiting
         if row is not None:
             outcome = row.outcome
             axes = sum(expected > 0 for expected in row.variance)

@@ -1,4 +1,4 @@
-"""Where each kind of message is published over Zenoh."""
+"""The Zenoh key of each kind of message."""
 
 from __future__ import annotations
 

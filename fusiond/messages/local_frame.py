@@ -1,11 +1,11 @@
-"""The published state in the frames that others use: a plane tangent to the Earth at an origin, axes by other conventions.
+"""The published state in a local frame: a plane tangent to the Earth at an origin, with axes of several conventions.
 
 Frames besides those of the glossary:
     l   local: the tangent plane at a fixed origin, its third axis vertical there
     o   odometry: the local frame less the filter's corrections, so that the pose in it never jumps, but drifts
 In the convention ENU_FLU, l is east-north-up and b is forward-left-up; in NED_FRD they are as in the glossary.
 
-In and out go the tuples of the messages; in between it is plain floats, many times faster than arrays of this size.
+Inputs and results are the tuples of the messages; plain floats are many times faster than arrays of this size.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from fusiond.maths.wgs84 import EARTH_RATE, ecef
 from fusiond.messages.types import Block, Quaternion, State, Triple
 from fusiond.units import SECOND
 
-GAP_NS = SECOND  # a longer pause is not bridged
+MAX_GAP_NS = SECOND  # a longer gap is not integrated
 
 
 class Convention(NamedTuple):
-    """Rotations into the axes of a convention, as quaternions (w, x, y, z); both are half turns, or none."""
+    """Rotations into the axes of a convention, as quaternions (w, x, y, z); both are half turns or the identity."""
 
     world: Quaternion  # from north-east-down
     body: Quaternion  # from forward-right-down
@@ -45,7 +45,7 @@ class LocalState:
     angular_rate_b: Triple  # rad/s, of the body against the Earth
     covariance_position_l: Block  # m^2
     covariance_attitude_l: Block  # rad^2, small rotations about the axes of l
-    covariance_velocity_b: Block  # m^2/s^2: that of the velocity over ground, turned; the attitude's error is not in it
+    covariance_velocity_b: Block  # m^2/s^2: of the velocity over ground, rotated; without the attitude's error
 
 
 class LocalFrame:
@@ -66,7 +66,7 @@ class LocalFrame:
         return cls(math.radians(state.lat_deg), math.radians(state.lon_deg), state.height_m, convention)
 
     def state(self, state: State) -> LocalState:
-        """A state in this frame. Axes at the state's position are turned to those at the origin."""
+        """A state in this frame. Axes at the state's position are rotated to those at the origin."""
         latitude, longitude = math.radians(state.lat_deg), math.radians(state.lon_deg)
         quaternion_ln = _product(self._quaternion_le, _quaternion_en(latitude, longitude))
         quaternion_nb = _product(state.quaternion_nb, self._convention.body)
@@ -90,7 +90,7 @@ class LocalFrame:
         )
 
     def covariance_axes(self, covariance_n: Block) -> Block:
-        """A covariance with its axes renamed by the convention, not turned to those at the origin."""
+        """A covariance with its axes renamed by the convention, not rotated to those at the origin."""
         return _turned(self._mat_world, covariance_n)
 
 
@@ -104,8 +104,8 @@ class Placed(NamedTuple):
 class OdometryFrame:
     """Keeps the odometry frame: the filter's velocity and turn rate, integrated from one state to the next.
 
-    Roll and pitch are the filter's own, which gravity holds; position and heading are free of its corrections. Over a
-    pause the frame rests in the local one.
+    Roll and pitch are the filter's own, which gravity keeps from drifting; position and heading are free of its corrections.
+    During a gap the frame does not move in the local one.
     """
 
     def __init__(self) -> None:
@@ -115,9 +115,9 @@ class OdometryFrame:
         self._last: tuple[int, LocalState] | None = None
 
     def follow(self, t_ns: int, state: LocalState) -> tuple[Placed, Placed]:
-        """Where the odometry frame is in the local one, and the body in the odometry frame. Stamps ascend."""
+        """The odometry frame in the local one, and the body in the odometry frame. Stamps must increase."""
         last, self._last = self._last, (t_ns, state)
-        if last is not None and 0 < t_ns - last[0] <= GAP_NS:
+        if last is not None and 0 < t_ns - last[0] <= MAX_GAP_NS:
             dt = (t_ns - last[0]) / SECOND
             step = _about_vertical(self._turn, _scaled(_sum(last[1].velocity_l, state.velocity_l), dt / 2))
             self._position_o = _sum(self._position_o, step)
@@ -141,7 +141,7 @@ def _correction(before: LocalState, after: LocalState, dt: float) -> float:
 
 
 def _quaternion_en(latitude: float, longitude: float) -> Quaternion:
-    """Rotation from north-east-down to earth-fixed axes: about the third by the longitude, then about the new second."""
+    """Rotation from north-east-down to earth-fixed axes: about the third axis by the longitude, then about the second."""
     (sz, cz), (sy, cy) = sin_cos(longitude / 2), sin_cos(-(latitude + math.pi / 2) / 2)
     return cz * cy, -sz * sy, cz * sy, sz * cy
 

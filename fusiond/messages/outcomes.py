@@ -1,4 +1,4 @@
-"""Outcomes as they are published: their names, and the counts of them."""
+"""Published outcomes: their names and counts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What goes out at a tick: the state, and when they are due the settled state, innovations, events and the health.
+"""The messages of a tick besides the state: the settled state, innovations, events and the health, when they are due.
 
-All but the latencies and what is said of inputs and outputs depends on the events and their receive stamps alone, so a
-replay makes the same messages as the live run did. The reason of a reset is in the filter's state.
+Everything but the latencies and the health of inputs and outputs depends only on the events and their receive stamps, so a
+replay makes the same messages as the live run. The reason of a reset is in the filter's state.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from fusiond.messages.types import (
     StateMessage,
 )
 from fusiond.timeline.aligner import ClockReport
+from fusiond.units import MILLISECOND, SECOND
 
-SECOND = 1_000_000_000  # ns
-RATE_DENOMINATOR = 1_000_000  # a rate is taken as a fraction with at most this, so that ticks never drift
-HEALTH_NS = SECOND  # between two of them, when nothing changes
-LOOK_NS = SECOND // 10  # between two looks at what the sources are held to be
-ABSENT_NS = 2 * SECOND  # a source that has brought nothing for so long is not present
+RATE_DENOMINATOR = 1_000_000  # a rate is converted to a fraction with at most this denominator, so that ticks never drift
+HEALTH_NS = SECOND  # between two health messages, when nothing changes
+STATUS_NS = SECOND // 10  # between two checks of the status of the sources
+ABSENT_NS = 2 * SECOND  # a source from which nothing came for this long is absent
 SEVERITY: Mapping[Mode, Severity] = {
     Mode.ALIGNING: "notice",
     Mode.NOMINAL: "info",
@@ -54,8 +54,8 @@ SEVERITY: Mapping[Mode, Severity] = {
 }
 
 
-class Surroundings(NamedTuple):
-    """What the health tells of the shell around the engine."""
+class IoHealth(NamedTuple):
+    """Health of inputs and outputs, and the latencies."""
 
     latency: LatencyHealth = LatencyHealth()
     inputs: Mapping[str, InputHealth] = {}
@@ -63,10 +63,10 @@ class Surroundings(NamedTuple):
 
 
 class Publication:
-    """What is published besides the states. `surroundings` is asked whenever a health is made."""
+    """The messages besides the states. `io_health` is called whenever a health message is made."""
 
-    def __init__(self, config: Config, fusion: Fusion, surroundings: Callable[[], Surroundings] = Surroundings) -> None:
-        self._vehicle, self._fusion, self._surroundings = config.vehicle.name, fusion, surroundings
+    def __init__(self, config: Config, fusion: Fusion, io_health: Callable[[], IoHealth] = IoHealth) -> None:
+        self._vehicle, self._fusion, self._io_health = config.vehicle.name, fusion, io_health
         settled = config.publish.settled_hz
         self._settled_ns = SECOND / Fraction(settled).limit_denominator(RATE_DENOMINATOR) if settled else None
         self._next_settled_ns = self._next_health_ns = 0  # from the first event
@@ -76,18 +76,18 @@ class Publication:
         self._changes = Changes(config, fusion)
 
     def add(self, event: Received, receipt: Receipt) -> None:
-        """Take note of a measurement and what became of it."""
+        """Add a measurement and its receipt."""
         self._sources.add(event)
         if self._innovations:
             self._innovations.add(receipt)
 
     def after_state(self, since_start_ns: int, state: StateMessage) -> Iterator[Message]:
-        """What goes out at a tick after its state, in order. To be taken whole, before anything else is done."""
+        """The messages of a tick after its state, in order. Consume all of them before anything else is done."""
         if self._settled_ns is not None and since_start_ns >= self._next_settled_ns:
             self._next_settled_ns = int((since_start_ns // self._settled_ns + 1) * self._settled_ns)
             yield from self._settled()
         if self._innovations:
-            yield from self._innovations.judged()
+            yield from self._innovations.published()
         events = list(self._changes.since(state, self._sources.present(state.t_ns)))
         yield from events
         if events or since_start_ns >= self._next_health_ns:
@@ -98,13 +98,13 @@ class Publication:
 
     def _settled(self) -> Iterator[Message]:
         estimate = self._fusion.settled()
-        if estimate.t_ns > self._last_settled_ns:  # not before the first, and each but once
+        if estimate.t_ns > self._last_settled_ns:  # each only once
             self._last_settled_ns = estimate.t_ns
             yield settled_message(estimate, self._vehicle, totals(self._fusion))
 
     def health(self, since_start_ns: int, state: StateMessage) -> HealthMessage:
-        """How everything is at the instant of a state."""
-        around = self._surroundings()
+        """The health message of the instant of a state."""
+        around = self._io_health()
         return HealthMessage(
             vehicle=self._vehicle,
             t_ns=state.t_ns,
@@ -140,11 +140,11 @@ class Sources:
         self._clocks[event.source] = event.clock
 
     def present(self, t_ns: int) -> frozenset[str]:
-        """The sources of which something was received lately."""
+        """The sources from which something was received recently."""
         return frozenset(source for source, last in self._received.items() if t_ns - last < ABSENT_NS)
 
     def measure_rates(self, t_ns: int) -> None:
-        """Receipts a second since the last time."""
+        """Update the receipts per second since the last call."""
         counted = self._fusion.history.counts.sum(axis=1)
         if self._counted_ns:
             rates = (counted - self._counted) * (SECOND / (t_ns - self._counted_ns))
@@ -153,7 +153,7 @@ class Sources:
 
     def health(self, t_ns: int) -> dict[str, SourceHealth]:
         fusion, present = self._fusion, self.present(t_ns)
-        beliefs = fusion.health(t_ns)
+        healths = fusion.health(t_ns)
         clocks, nis, counts = fusion.clock.report(), nis_means(fusion), fusion.history.counts.tolist()
         found = {}
         for i, source in enumerate(fusion.plan.sources):
@@ -161,20 +161,20 @@ class Sources:
             found[source] = SourceHealth(
                 outcomes=outcome_counts(counts[i]),
                 present=source in present,
-                age_ms=None if last is None else (t_ns - last) / 1e6,
+                age_ms=None if last is None else (t_ns - last) / MILLISECOND,
                 rate_hz=self._rates[source],
                 test_ratio=_last_ratio(fusion, i),
                 nis_mean=nis.get(source),
                 clock=_clock_health(self._clocks.get(source), clocks),
-                probabilities=Probabilities(**dict(zip(STATUSES, beliefs[source].probabilities, strict=True))),
-                status=cast(SourceStatus, beliefs[source].status),
-                reason=beliefs[source].reason or None,
+                probabilities=Probabilities(**dict(zip(STATUSES, healths[source].probabilities, strict=True))),
+                status=cast(SourceStatus, healths[source].status),
+                reason=healths[source].reason or None,
             )
         return found
 
 
 class Changes:
-    """What changed from one tick to the next: mode, resets, sources that come and go."""
+    """Changes from one tick to the next: mode, resets, sources that appear, disappear or change their status."""
 
     def __init__(self, config: Config, fusion: Fusion) -> None:
         self.reset_reason: str | None = None
@@ -183,17 +183,17 @@ class Changes:
         self._resets = 0
         self._present: frozenset[str] = frozenset()
         self._statuses = dict.fromkeys(fusion.plan.sources, "nominal")
-        self._look_ns: int = NEVER
+        self._next_status_ns: int = NEVER
 
     def since(self, state: StateMessage, present: frozenset[str]) -> Iterator[EventMessage]:
-        """The events between the tick before and this one."""
+        """The events since the previous tick."""
 
         def event(**fields: Any) -> EventMessage:
             return EventMessage(vehicle=state.vehicle, t_ns=state.t_ns, **fields)
 
         if state.resets != self._resets:
             if state.resets > self._resets:
-                self.reset_reason = self._why()
+                self.reset_reason = self._reason()
                 yield event(kind="reset", severity="warning", subject="", text=f"state reset: {self.reset_reason}")
             self._resets = state.resets
         if state.mode is not self._mode:
@@ -206,17 +206,17 @@ class Changes:
             text = f"{source}: nothing received for {ABSENT_NS / SECOND:g} s"
             yield event(kind="source_lost", severity="warning", subject=source, text=text)
         self._present = present
-        if state.t_ns >= self._look_ns:
-            self._look_ns = state.t_ns + LOOK_NS
-            for source, belief in self._fusion.health(state.t_ns).items():
-                if belief.status not in ("absent", self._statuses[source]):  # that it is gone is told above
-                    self._statuses[source] = belief.status
-                    good = belief.status == "nominal"
-                    text = f"{source}: {belief.status}" + (f": {belief.reason}" if belief.reason else "")
+        if state.t_ns >= self._next_status_ns:
+            self._next_status_ns = state.t_ns + STATUS_NS
+            for source, health in self._fusion.health(state.t_ns).items():
+                if health.status not in ("absent", self._statuses[source]):  # source_lost reports an absent source
+                    self._statuses[source] = health.status
+                    good = health.status == "nominal"
+                    text = f"{source}: {health.status}" + (f": {health.reason}" if health.reason else "")
                     yield event(kind="source_status", severity="info" if good else "warning", subject=source, text=text)
 
-    def _why(self) -> str:
-        """Why the state was reset, in words."""
+    def _reason(self) -> str:
+        """The reason of the last reset, in words."""
         stamps = self._fusion.history.head.stamps
         source = self._fusion.plan.sources[int(stamps[RESET_SOURCE])]
         return {
@@ -224,20 +224,20 @@ class Changes:
             ResetReason.DATA_GAP: f"no data for more than {self._config.filter.restart_gap_s:g} s; aligning again",
             ResetReason.HEADING_LOST: "the heading was lost without the IMU; aligning again",
             ResetReason.NOT_FINITE: "the state was not finite; aligning again",
-            ResetReason.SOURCE_RETURNED: f"{source} was rejected too long with a constant error; the state was set to it",
+            ResetReason.SOURCE_RETURNED: f"{source}: rejected with a constant error for too long; the state was set to it",
             ResetReason.HEADING_DECIDED: "the drive contradicted or confirmed the stored heading; the heading is decided",
         }[ResetReason(int(stamps[RESET_REASON]))]
 
 
 def nis_means(fusion: Fusion) -> dict[str, float]:
-    """By source, over the horizon: the mean of the squared innovations per axis, in sigmas."""
+    """By source: the mean over the horizon of the squared innovations per axis, in sigmas."""
     rows = fusion.history.rows
     axes = np.count_nonzero(rows["variance"] > 0, axis=1)
-    judged = (axes > 0) & np.isfinite(rows["ratio"])
-    squares = rows["ratio"][judged] * np.array(fusion.plan.gates)[axes[judged]] / axes[judged]
+    tested = (axes > 0) & np.isfinite(rows["ratio"])
+    squares = rows["ratio"][tested] * np.array(fusion.plan.gates)[axes[tested]] / axes[tested]
     number = len(fusion.plan.sources)
-    counts = np.bincount(rows["source"][judged], minlength=number)
-    sums = np.bincount(rows["source"][judged], weights=squares, minlength=number)
+    counts = np.bincount(rows["source"][tested], minlength=number)
+    sums = np.bincount(rows["source"][tested], weights=squares, minlength=number)
     return {name: float(sums[i] / counts[i]) for i, name in enumerate(fusion.plan.sources) if counts[i]}
 
 
@@ -245,8 +245,8 @@ def _last_ratio(fusion: Fusion, source: int) -> float | None:
     head = fusion.history.head
     stamps = head.source_stamps[source]
     ratio = float(head.memory[source, LAST_RATIO])
-    judged = stamps[T_FUSED] != NEVER or stamps[T_REJECTED] != NEVER
-    return ratio if judged and math.isfinite(ratio) else None
+    tested = stamps[T_FUSED] != NEVER or stamps[T_REJECTED] != NEVER
+    return ratio if tested and math.isfinite(ratio) else None
 
 
 def _clock_health(name: str | None, clocks: Mapping[str, ClockReport]) -> ClockHealth | None:
@@ -256,9 +256,9 @@ def _clock_health(name: str | None, clocks: Mapping[str, ClockReport]) -> ClockH
     return ClockHealth(
         name=name or "arrival",
         method=report.method,
-        offset_ms=report.offset_ns / 1e6,
+        offset_ms=float(report.offset_ns) / MILLISECOND,
         drift_ppm=report.drift_ppm,
-        jitter_ms=report.jitter_ns / 1e6,
+        jitter_ms=report.jitter_ns / MILLISECOND,
         resets=report.resets,
         strays=report.strays,
         note=report.note,

@@ -1,6 +1,6 @@
 """The types of the published messages, with the meaning and unit of every field.
 
-No message carries a number that is not finite. Messages are immutable: a reader in any thread sees the state and the
+No message has a number that is not finite. Messages are immutable: a reader in any thread sees the state and the
 covariance of one instant.
 """
 
@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 from fusiond.config.outputs import Encoding
 from fusiond.estimator.solution import Mode
 
-SCHEMA_VERSION = 1  # raised when a field changes its meaning, its unit or its type, or goes; not when one is added
+SCHEMA_VERSION = 1  # raised when a field is removed or changes its meaning, unit or type; not when one is added
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -122,7 +122,7 @@ class InnovationMessage(Message, frozen=True, kw_only=True):
 
 
 class EventMessage(Message, frozen=True, kw_only=True):
-    """An event that an operator may want to know of at once, on fusiond/<vehicle>/events."""
+    """An event that an operator may want to see at once, on fusiond/<vehicle>/events."""
 
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
@@ -130,7 +130,7 @@ class EventMessage(Message, frozen=True, kw_only=True):
     kind: Annotated[EventKind, _about("mode, reset, source_lost, source_found or source_status")]
     severity: Annotated[Severity, _about("info, notice, warning or critical")]
     subject: Annotated[str, _about("the mode entered, or the source; empty for a reset")]
-    text: Annotated[str, _about("one line for people")]
+    text: Annotated[str, _about("one line of text")]
 
 
 class Quantiles(Message, frozen=True, kw_only=True):
@@ -205,7 +205,7 @@ class OutputHealth(Message, frozen=True, kw_only=True):
     offered: Annotated[int, _about("messages put into its queue")]
     dropped: Annotated[int, _about("messages dropped, the oldest first, because the output was slow or away")]
     latency_ms: Annotated[
-        Quantiles | None, _about("from the instant of a publication to its being sent or taken from the queue; null before")
+        Quantiles | None, _about("from the instant of a publication until it is sent or taken from the queue; null if none")
     ] = None
     counts: Annotated[dict[str, int], _about("other counts, by kind")]
     notes: Annotated[dict[str, str], _about("further notes, such as whether the autopilot uses the state")]
@@ -261,7 +261,7 @@ class ConfigMessage(Message, frozen=True, kw_only=True):
     config: Annotated[dict[str, Any], _about("the configuration, defaults filled in")]
 
 
-MESSAGES: dict[str, type[Message]] = {  # by the last part of the key; of innovations, each source has a key of its own
+MESSAGES: dict[str, type[Message]] = {  # by the last part of the key; innovations have a key for each source
     "state": StateMessage,
     "settled": SettledMessage,
     "health": HealthMessage,

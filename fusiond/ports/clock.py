@@ -1,4 +1,4 @@
-"""The clock that stamps what is received: a live run's is the host's, a played drive has its own."""
+"""The clock that stamps receipts: the host's in a live run; a played drive has its own."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ class Clock(Protocol):
 
     @property
     def speed(self) -> float:
-        """How many times as fast as real time it runs."""
+        """Its speed relative to real time."""
 
     def now_ns(self) -> int:
         """The present instant."""
 
     def from_wall_ns(self, wall_ns: int) -> int:
-        """The instant that the wall clock called `wall_ns` a moment ago."""
+        """The instant of a recent stamp of the wall clock."""

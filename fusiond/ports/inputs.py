@@ -2,7 +2,7 @@
 
 Each input is read in a thread of its own: receipts are stamped when they happen, and no input can delay another. A full
 inbox is thinned: every third frame of the most frequent kinds is dropped and counted. An estimator that cannot keep up
-still gets frames of every kind, evenly spread, and all of the rare kinds.
+still gets frames of every kind, evenly spaced, and all frames of the rare kinds.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from fusiond.events import Received
 from fusiond.ports.clock import Clock
 
 Item = TypeVar("Item")
-THIN = 3  # a full inbox drops every third frame; with every second, a rolling counter would seem to stand still
-POLL_S = 0.2  # a thread looks at least this often whether it should stop
+THIN = 3  # a full inbox drops every third frame; with every second, a rolling counter would seem to stop
+POLL_S = 0.2  # a thread checks at least this often whether it should stop
 
 
 class InputLost(Exception):
@@ -27,8 +27,8 @@ class InputLost(Exception):
 
 
 class Inbox(Generic[Item]):
-    """Stamped frames on their way from an input's thread to the engine, at most `size`. `wake` is called when an empty
-    one fills; `kind` gives the kind of a frame, such as its message id."""
+    """Stamped frames on their way from an input's thread to the engine, at most `size`. `wake` is called when a frame
+    comes into an empty inbox; `kind` returns the kind of a frame, such as its message id."""
 
     def __init__(self, size: int, wake: Callable[[], None], kind: Callable[[Item], Hashable]) -> None:
         self.received = self.dropped = 0
@@ -49,14 +49,14 @@ class Inbox(Generic[Item]):
             self._wake()
 
     def take(self) -> list[tuple[int, Item]]:
-        """The frames put since the last time, oldest first."""
+        """Remove and return all frames, oldest first."""
         with self._lock:
             items, self._items = self._items, []
         return items
 
     def _thin(self) -> None:
         """Drop every third frame of each kind that is more frequent than the mean. A frame after a longer gap than usual is
-        kept, so the rest is evenly spread. With too many different kinds, drop the oldest third."""
+        kept, so the rest is evenly spaced. If there are too many kinds, drop the oldest third."""
         kinds = [self._kind(item) for _, item in self._items]
         stamps: dict[Hashable, list[int]] = {}
         for (t_ns, _), kind in zip(self._items, kinds, strict=True):
@@ -87,15 +87,15 @@ class LiveInput(Protocol[Item]):
     """One link or bus. `prepare` and `session` run in a thread; `decode` and `record` are called by the engine."""
 
     name: str
-    about: str  # for people
-    file: str  # name of the log for its frames, without the date
+    about: str  # description for users
+    file: str  # name of the log of its frames, without the date
     inbox: Inbox[Item]
 
     def configure(self, config: Config) -> None:
-        """Use a new configuration from the next session on. Raises ConfigError."""
+        """Use a new configuration from the next session. Raises ConfigError."""
 
     def prepare(self) -> None:
-        """Do slow loading once, before the first session. Raises ConfigError."""
+        """Load what is slow to load, once, before the first session. Raises ConfigError."""
 
     def session(self, stop: Event) -> None:
         """Open, read into the inbox until `stop` is set, close. Raises InputLost."""
@@ -104,18 +104,18 @@ class LiveInput(Protocol[Item]):
         """The events in a frame."""
 
     def record(self, item: Item, t_ns: int) -> bytes:
-        """The bytes of a frame in its log."""
+        """The bytes of a frame for its log."""
 
     def counts(self) -> dict[str, int]:
-        """Frames so far, counted by what was done with them."""
+        """Counts of frames by outcome."""
 
 
 @dataclass(frozen=True)
-class Receiver:
-    """What an input works for: the part of the daemon that takes its frames."""
+class InputContext:
+    """What an input needs of the daemon."""
 
     clock: Clock  # stamps the receipts
-    wake: Callable[[], None]  # called when an empty inbox fills
-    is_alive: Callable[[], bool]  # whether the estimator works: an input answers its peer only then
+    wake: Callable[[], None]  # called when a frame comes into an empty inbox
+    is_alive: Callable[[], bool]  # whether the estimator works: heartbeats are sent only then
 
 

@@ -1,8 +1,8 @@
 """The interface of live outputs, and the bounded outbox between the estimator and an output's thread.
 
-Each output sends in a thread of its own: a slow or dead consumer delays neither the estimator nor another output. When an
-outbox is full, the oldest message is dropped and counted. An output whose sending never waits can get states directly in
-the estimator's thread.
+Each output sends in a thread of its own: a slow or dead reader delays neither the estimator nor another output. When an
+outbox is full, the oldest message is dropped and counted. An output that never blocks can send states directly in the
+estimator's thread.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fusiond.messages.types import Message, StateMessage
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import LiveInput
 
-POLL_S = 0.2  # an output's thread looks at least this often whether it should stop
+POLL_S = 0.2  # an output's thread checks at least this often whether it should stop
 
 
 class OutputLost(Exception):
@@ -29,29 +29,29 @@ class Outbox:
     """Messages on their way from the estimator to an output's thread."""
 
     def __init__(self, size: int, wants: tuple[type[Message], ...]) -> None:
-        """`wants` are the kinds of messages that are let in."""
+        """`wants` are the kinds of messages that it accepts."""
         self.offered = self.dropped = 0
-        self.latency = RecentLatencies()  # from the instant of a state to its being taken, or sent directly
+        self.latency = RecentLatencies()  # from the instant of a state until it is taken or sent directly
         self.at_once: Callable[[StateMessage], bool] | None = None
-        """Sends a state in the estimator's thread, and never waits. False: it could not, and the state is queued."""
+        """Sends a state in the estimator's thread without waiting. False: it could not, and the state is queued."""
         self.patience_s = 0.0
-        """How long `put` may wait for room before it drops the oldest message; 0 in a live run. With patience, `put` queues
+        """How long `put` may wait for room before it drops the oldest message; 0 in a live run. If it is not 0, `put` queues
         states too, so that none is lost."""
         self._wants = wants
         self._messages: deque[Message] = deque(maxlen=size)
-        self._stalled = False  # it waited in vain, and nothing has been taken since
+        self._stalled = False  # `put` waited in vain, and nothing has been taken since
         self._changed = Condition()
         self._now: Callable[[], int] | None = None
         self._on_opened: Callable[[], None] | None = None
 
     def attend(self, now: Callable[[], int], on_opened: Callable[[], None]) -> None:
-        """Before a session: `on_opened` is called in the output's thread when it first takes messages, which means that it
-        is open. Latencies are measured by `now`."""
+        """Prepare a session: `on_opened` is called in the output's thread when it first takes messages, that is when it is
+        open. Latencies are measured by `now`."""
         self._now, self._on_opened = now, on_opened
 
     def put(self, message: Message, *, may_wait: bool = True) -> None:
-        """Add a message, if it is of a wanted kind. Without `patience_s` it never waits for the reader; the reader's own
-        thread must not wait (`may_wait`)."""
+        """Add a message of a kind that it accepts. Without `patience_s` it never waits for the reader. The reader's own
+        thread must not wait: `may_wait` is False there."""
         if not isinstance(message, self._wants):
             return
         with self._changed:
@@ -68,7 +68,7 @@ class Outbox:
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> list[Message]:
-        """The messages put since the last time, oldest first; waits up to `timeout_s` for the first. Empty after that."""
+        """Remove and return all messages, oldest first, after waiting up to `timeout_s` for one; empty if none came."""
         if self._on_opened:
             on_opened, self._on_opened = self._on_opened, None
             on_opened()
@@ -88,14 +88,14 @@ class Outbox:
 
     @property
     def waiting(self) -> int:
-        """Messages that nobody has taken yet."""
+        """Number of messages not taken yet."""
         return len(self._messages)
 
     def _is_full(self) -> bool:
         return len(self._messages) == self._messages.maxlen
 
     def rouse(self) -> None:
-        """Make a waiting `take` return, for instance because the output should stop."""
+        """Make a waiting `take` return, for example because the output should stop."""
         with self._changed:
             self._changed.notify_all()
 
@@ -104,24 +104,24 @@ class LiveOutput(Protocol):
     """One output. `session` runs in a thread of its own, under the daemon's supervisor."""
 
     name: str
-    about: str  # for people
+    about: str  # description for users
     outbox: Outbox
 
     def session(self, stop: Event) -> None:
-        """Open, send what the outbox gets until `stop` is set, then what is left in it, close. Raises OutputLost."""
+        """Open, send messages until `stop` is set and the outbox is empty, close. Raises OutputLost."""
 
     def counts(self) -> dict[str, int]:
-        """Messages so far, counted by what was done with them."""
+        """Counts of messages by outcome."""
 
     def notes(self) -> dict[str, str]:
         """Notes for the health, such as whether the autopilot uses the state."""
 
 
 @dataclass(frozen=True)
-class Around:
-    """What an output can use besides the configuration."""
+class OutputContext:
+    """What an output can use in addition to the configuration."""
 
     clock: Clock  # the time line of all stamps
-    inputs: Mapping[str, LiveInput[Any]]  # by kind and name, such as mavlink.fc: to send over a link that is open anyway
+    inputs: Mapping[str, LiveInput[Any]]  # by section and name, such as mavlink.fc: to send over a link that is already open
 
 

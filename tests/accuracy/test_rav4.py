@@ -11,7 +11,7 @@ import pytest
 from fusiond.app.replay.comparison import TruthReport, Window
 from fusiond.app.replay.intervals import parse_withheld
 from fusiond.app.replay.job import Options, replay
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as configuration
 from fusiond.config.schema import Config
 from fusiond.filter.calibration import calibrations
@@ -58,7 +58,7 @@ def logs(tlog: str) -> list[str]:
 
 def learnt(config: Config, tlog: str) -> dict[str, tuple[float, float]]:
     """Value and sigma of every calibration at the end of the drive."""
-    run = Replay(config, Wants(config.publish.rate_hz))
+    run = Replay(config, ReplayTask(config.publish.rate_hz))
     run.run(open_logs(logs(tlog), config))
     return calibrations(run.fusion.plan, run.fusion.history.head)
 

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.messages.types import Message
@@ -31,7 +31,7 @@ LOGS = ("drive.tlog", "drive.log")
 
 @cache
 def folder() -> Path:
-    """Where the drive's files are. Dead reckoning from second 6.5 on."""
+    """The folder of the drive's files. Dead reckoning from second 6.5 on."""
     temporary = TemporaryDirectory(prefix="fusiond-drive-")
     atexit.register(temporary.cleanup)
     path = Path(temporary.name)
@@ -48,7 +48,7 @@ def settings() -> Config:
 @cache
 def messages() -> tuple[Message, ...]:
     """Everything published at 50 Hz: states, settled states, innovations, events, health."""
-    told: list[Message] = []
+    published: list[Message] = []
     logs = open_logs([str(folder() / log) for log in LOGS], settings())
-    Replay(settings(), Wants(50.0, on_message=[told.append])).run(logs)
-    return tuple(told)
+    Replay(settings(), ReplayTask(50.0, on_message=[published.append])).run(logs)
+    return tuple(published)

@@ -14,7 +14,7 @@ from fusiond_adapters.mavlink.answers import Parameter
 from fusiond_adapters.mavlink.ground_station import GroundStation
 from fusiond_adapters.mavlink.link import MavlinkLink
 from tests.helpers.live import configuration
-from tests.helpers.mavlink_peers import CLOCK, SYSTEM, Ear, UdpListener
+from tests.helpers.mavlink_peers import CLOCK, SYSTEM, Endpoint, UdpListener
 
 STATION, MARKER = 255, 42
 STREAMS = ("GLOBAL_POSITION_INT_COV", "LOCAL_POSITION_NED_COV", "ATTITUDE_QUATERNION_COV")
@@ -23,7 +23,7 @@ SET, GET, REQUEST = 511, 510, 512
 
 
 class Now:
-    """A clock that can be put forward."""
+    """A clock that can be set forward."""
 
     ahead_ns = 0
 
@@ -45,8 +45,8 @@ def station_at(
     return GroundStation(settings, {"mavlink.fc": link}, now, parameters), now
 
 
-def from_station(peer: UdpListener) -> Ear:
-    return Ear(peer, STATION, 190)
+def from_station(peer: UdpListener) -> Endpoint:
+    return Endpoint(peer, STATION, 190)
 
 
 def long(command: int, *values: float, system: int = SYSTEM, component: int = 191) -> Any:

@@ -20,6 +20,7 @@ from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
 from fusiond.ports.outputs import LiveOutput
+from fusiond.units import MICROSECOND
 from tests.helpers.network import DEADLINE, Send
 
 SYSTEM, COMPONENT = 7, 1
@@ -32,7 +33,7 @@ BO_ 256 AXLE: 8 ECU
 
 
 def configuration(folder: Path, connection: str, more: str = "", channel: str = "none") -> Config:
-    """One link, one virtual bus, standing vehicle with a given heading."""
+    """One link, one virtual bus, a vehicle at rest with a given heading."""
     (folder / "axle.dbc").write_text(DBC)
     text = f"""
 [vehicle]
@@ -76,8 +77,8 @@ class Autopilot:
 
     @property
     def time_us(self) -> int:
-        """Since its boot: this machine's."""
-        return time.monotonic_ns() // 1000
+        """Time since the boot: that of this machine."""
+        return time.monotonic_ns() // MICROSECOND
 
     def pack(self, message: common.MAVLink_message) -> bytes:
         packed = bytes(message.pack(self._link))
@@ -102,7 +103,7 @@ class Autopilot:
 
 
 def parsed(data: bytes) -> list[common.MAVLink_message]:
-    """The messages in what fusiond said; pymavlink checks them."""
+    """The messages in bytes from fusiond; pymavlink checks them."""
     return common.MAVLink(None).parse_buffer(data) or []
 
 
@@ -140,7 +141,7 @@ class Running:
             self._changed.notify_all()
 
     def until(self, condition: Callable[[], bool]) -> None:
-        """Wait until something holds; it is looked at whenever a state is published, and ten times a second."""
+        """Wait until a condition holds; it is checked whenever a state is published, and ten times a second."""
         for _ in range(int(DEADLINE * 10)):
             with self._changed:
                 if condition():
@@ -149,7 +150,7 @@ class Running:
         raise AssertionError(f"not reached: {self.daemon.status()}, {self.daemon.losses()}")
 
     def call(self, action: Callable[[], None]) -> None:
-        """Have something done in the daemon's loop."""
+        """Call a function in the daemon's loop."""
         self.loop.call_soon_threadsafe(action)
 
     def start(self) -> None:
@@ -162,7 +163,7 @@ class Running:
         self.join()
 
     def join(self) -> None:
-        """Wait for the end. Raises what the daemon raised."""
+        """Wait for the end. Raises the daemon's exception."""
         self._thread.join(DEADLINE)
         assert not self._thread.is_alive(), "the daemon does not end"
         if self._errors:
@@ -177,7 +178,7 @@ def running(
     outputs: Sequence[LiveOutput] = (),
     zenoh: bool = False,
 ) -> Iterator[Running]:
-    """A daemon that runs inside the block, and has ended in order after it."""
+    """A daemon that runs inside the block and has ended after it."""
     run = Running(settings, load, outputs=outputs, zenoh=zenoh)
     run.start()
     try:
@@ -192,9 +193,9 @@ def axle(left: int = 0, right: int = 0) -> can.Message:
 
 
 def drive(run: Running, send: Send, bus: can.BusABC | None, until: Callable[[], bool], autopilot: Autopilot) -> None:
-    """Play an autopilot, and wheels, until something holds: one IMU sample after each publication."""
-    source = run.daemon.inputs["mavlink.fc"]
-    run.until(lambda: source.counts()["sessions"] == 1)
+    """Play an autopilot and wheels until a condition holds: one IMU sample after each publication."""
+    link = run.daemon.inputs["mavlink.fc"]
+    run.until(lambda: link.counts()["sessions"] == 1)
     for round_ in range(1500):
         if until():
             return

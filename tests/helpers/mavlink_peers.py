@@ -1,7 +1,7 @@
 """States of a moving vehicle, peers over UDP and TCP, and stand-ins for autopilots, for the tests of MAVLink outputs.
 
-The stand-ins drop and refuse what ArduPilot and PX4 do, and turn what they take into latitude, longitude and velocity
-over ground by the autopilots' own equations. Sources: ArduPilot's GCS_Common.cpp (handle_odometry,
+The stand-ins drop and refuse what ArduPilot and PX4 do, and turn what they accept into latitude, longitude and velocity
+over ground by the autopilots' own equations. References: ArduPilot's GCS_Common.cpp (handle_odometry,
 handle_common_vision_position_estimate_data), AP_VisualOdom_MAV.cpp, AP_GPS_MAV.cpp and Location.cpp (offset_latlng); PX4's
 mavlink_receiver.cpp (handle_message_odometry, handle_message_vision_position_estimate) and geo.cpp (reproject).
 """
@@ -28,8 +28,8 @@ from fusiond.messages.types import OutcomeCounts, State, StateMessage
 from fusiond.ports.inputs import Inbox
 from fusiond.units import MILLISECOND as MS
 from fusiond_adapters.host.clock import HostClock
+from fusiond_adapters.mavlink.housekeeping import Housekeeping
 from fusiond_adapters.mavlink.link import MavlinkLink
-from fusiond_adapters.mavlink.talk import MavlinkTalk
 from tests.helpers.live import configuration
 from tests.helpers.network import DEADLINE
 
@@ -72,7 +72,7 @@ class Peer(Protocol):
 
 
 class UdpPeer:
-    """Sends to a link that listens, hears what comes back."""
+    """Sends to a link that listens, receives the replies."""
 
     def __init__(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -112,7 +112,7 @@ class UdpListener(UdpPeer):
 
 
 class TcpPeer:
-    """Listens; the one under test connects. `buffer` bounds what it takes without being read."""
+    """Listens; the one under test connects. `buffer` limits what it accepts without being read."""
 
     def __init__(self, buffer: int | None = None) -> None:
         self._listener = socket.socket()
@@ -146,22 +146,22 @@ class TcpPeer:
         self._listener.close()
 
 
-class Ear:
-    """The messages that a peer hears; pymavlink checks every frame."""
+class Endpoint:
+    """A peer with the messages that it received; pymavlink checks every frame."""
 
     def __init__(self, peer: Peer, system: int = SYSTEM, component: int = COMPONENT) -> None:
         self.peer = peer
         self.messages: list[Any] = []
-        self.voice = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+        self.sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self._parser = dialect.MAVLink(None)
         self._parser.robust_parsing = True
 
-    def say(self, message: Any) -> None:
-        self.peer.send(bytes(message.pack(self.voice)))
-        self.voice.seq = (self.voice.seq + 1) & 0xFF
+    def send(self, message: Any) -> None:
+        self.peer.send(bytes(message.pack(self.sender)))
+        self.sender.seq = (self.sender.seq + 1) & 0xFF
 
     def heartbeat(self, maker: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA) -> None:
-        self.say(dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GROUND_ROVER, maker, 0, 0, 4, 3))
+        self.send(dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GROUND_ROVER, maker, 0, 0, 4, 3))
 
     def listen(self) -> None:
         self.messages += self._parser.parse_buffer(self.peer.receive()) or []
@@ -170,10 +170,10 @@ class Ear:
         return [message for message in self.messages if message.get_type() in names]
 
     def until(self, condition: Callable[[], bool]) -> None:
-        """Listen until something holds."""
+        """Listen until a condition holds."""
         end = time.monotonic() + DEADLINE
         while not condition():
-            assert time.monotonic() < end, f"not reached; heard {[m.get_type() for m in self.messages]}"
+            assert time.monotonic() < end, f"not reached; received {[m.get_type() for m in self.messages]}"
             self.listen()
 
     def texts(self) -> list[str]:
@@ -199,15 +199,15 @@ def link_to(peer: Peer, folder: Path, more: str = "") -> tuple[Config, MavlinkLi
 
 
 class Recorder:
-    """Stands for a link whose peer is not of interest."""
+    """Stands in for a link whose peer does not matter."""
 
     def __init__(self, settings: Any, *, open_: bool = True) -> None:
         self.listeners: list[Callable[[bytes, int], None]] = []
-        self.talk = MavlinkTalk(settings, "fc")
+        self.housekeeping = Housekeeping(settings, "fc")
         self.sent: list[Any] = []
         self.open = open_
 
-    def send(self, message: Any, voice: Any = None) -> bool:
+    def send(self, message: Any, sender: Any = None) -> bool:
         if self.open:
             self.sent.append(message)
         return self.open
@@ -236,21 +236,21 @@ def serving(*parts: HasSession) -> Iterator[None]:
     assert not any(thread.is_alive() for thread in threads)
 
 
-def greeted(ear: Ear, link: MavlinkLink, maker: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA) -> None:
-    """Wait until the link has heard the peer's heartbeat: UDP has no other way to know that it listens."""
-    ear.heartbeat(maker)
+def greeted(endpoint: Endpoint, link: MavlinkLink, maker: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA) -> None:
+    """Wait until the link has received the peer's heartbeat: UDP has no other way to know that it listens."""
+    endpoint.heartbeat(maker)
     end = time.monotonic() + DEADLINE
-    while link.talk.target is None:
+    while link.housekeeping.target is None:
         assert time.monotonic() < end
-        ear.listen()
-        ear.heartbeat(maker)
+        endpoint.listen()
+        endpoint.heartbeat(maker)
 
 
 # --- Autopilots
 
 
-class Taken(NamedTuple):
-    """What an autopilot's estimator gets; None where it gets nothing of the kind."""
+class Accepted(NamedTuple):
+    """The data that an autopilot's estimator gets; None for what it does not get."""
 
     time_us: int
     latitude_deg: float
@@ -258,13 +258,13 @@ class Taken(NamedTuple):
     height_m: float
     velocity_n: Triple | None
     quaternion: tuple[float, ...] | None
-    variances: tuple[float, ...]  # what the estimator makes of the covariances
+    variances: tuple[float, ...]  # as the estimator uses them
     reset_counter: int | None
     quality: int
 
 
 class ArduPilot:
-    """With the EKF's origin where the test puts it. `dropped` counts what it drops silently."""
+    """With the EKF's origin given by the test. `dropped` counts what it drops silently."""
 
     M_PER_E7 = 0.011131884502145034  # LOCATION_SCALING_FACTOR
 
@@ -272,13 +272,13 @@ class ArduPilot:
         self._origin, self._quality_minimum = origin, quality_minimum
         self.dropped = 0
 
-    def take(self, m: Any) -> Taken | None:
-        taken = getattr(self, f"_{m.get_type().lower()}")(m)
-        self.dropped += taken is None
-        assert taken is None or isinstance(taken, Taken)
-        return taken
+    def accept(self, m: Any) -> Accepted | None:
+        accepted = getattr(self, f"_{m.get_type().lower()}")(m)
+        self.dropped += accepted is None
+        assert accepted is None or isinstance(accepted, Accepted)
+        return accepted
 
-    def _odometry(self, m: Any) -> Taken | None:
+    def _odometry(self, m: Any) -> Accepted | None:
         if m.frame_id != 20 or m.child_frame_id != 12:  # MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD
             return None
         if m.quality < self._quality_minimum:
@@ -286,11 +286,11 @@ class ArduPilot:
         velocity = rotated(m.q, (m.vx, m.vy, m.vz))
         return self._pose(m.time_usec, m, tuple(m.q), m.pose_covariance, (velocity, m.reset_counter, m.quality))
 
-    def _vision_position_estimate(self, m: Any) -> Taken:
+    def _vision_position_estimate(self, m: Any) -> Accepted:
         q = quaternion(matrix_from_euler(m.roll, m.pitch, m.yaw)).tolist()
         return self._pose(m.usec, m, tuple(q), m.covariance, (None, m.reset_counter, 0))
 
-    def _pose(self, time_us: int, m: Any, q: tuple[float, ...], covariance: list[float], rest: Any) -> Taken:
+    def _pose(self, time_us: int, m: Any, q: tuple[float, ...], covariance: list[float], rest: Any) -> Accepted:
         errors = ()
         if not math.isnan(covariance[0]):
             position = covariance[0] + covariance[6] + covariance[11]
@@ -300,19 +300,19 @@ class ArduPilot:
         scale = max(math.cos(math.radians((lat + latitude) / 2)), 0.01)
         lon = longitude + m.y / self.M_PER_E7 / 1e7 / scale
         velocity, resets, quality = rest
-        return Taken(time_us, lat, lon, height - m.z, velocity, q, errors, resets, quality)
+        return Accepted(time_us, lat, lon, height - m.z, velocity, q, errors, resets, quality)
 
-    def _gps_input(self, m: Any) -> Taken | None:
+    def _gps_input(self, m: Any) -> Accepted | None:
         if m.fix_type < 3 or m.time_week == 0 or m.ignore_flags:
             return None
         q = None if m.yaw == 0 else quaternion(matrix_from_euler(0, 0, math.radians(m.yaw / 100))).tolist()
         errors = m.horiz_accuracy, m.vert_accuracy, m.speed_accuracy
         time_us = m.time_week * 604_800_000_000 + m.time_week_ms * 1000
-        return Taken(time_us, m.lat / 1e7, m.lon / 1e7, m.alt, (m.vn, m.ve, m.vd), q, errors, None, 0)
+        return Accepted(time_us, m.lat / 1e7, m.lon / 1e7, m.alt, (m.vn, m.ve, m.vd), q, errors, None, 0)
 
 
 class Px4:
-    """With the local frame's reference where the test puts it. `refused` counts what it refuses."""
+    """With the local frame's reference given by the test. `refused` counts what it refuses."""
 
     RADIUS = 6_371_000.0
 
@@ -320,16 +320,16 @@ class Px4:
         self._origin, self._quality_minimum = origin, quality_minimum
         self.refused = 0
 
-    def take(self, m: Any) -> Taken | None:
-        taken = getattr(self, f"_{m.get_type().lower()}", lambda _: None)(m)
-        self.refused += taken is None
-        assert taken is None or isinstance(taken, Taken)
-        return taken
+    def accept(self, m: Any) -> Accepted | None:
+        accepted = getattr(self, f"_{m.get_type().lower()}", lambda _: None)(m)
+        self.refused += accepted is None
+        assert accepted is None or isinstance(accepted, Accepted)
+        return accepted
 
-    def _odometry(self, m: Any) -> Taken | None:
+    def _odometry(self, m: Any) -> Accepted | None:
         if m.estimator_type not in (0, 1, 2, 3):  # UNKNOWN, NAIVE, VISION, VIO; MOCAP goes elsewhere
             return None
-        if m.frame_id != 1:  # in LOCAL_FRD (20) the heading is arbitrary: no use to one who knows north
+        if m.frame_id != 1:  # in LOCAL_FRD (20) the heading is arbitrary: no use where north is known
             return None
         if m.child_frame_id != 12 or not all(map(math.isfinite, (*m.q, m.x, m.y, m.z, m.vx, m.vy, m.vz))):
             return None
@@ -339,12 +339,12 @@ class Px4:
         diagonal = [pose[i] for i in (0, 6, 11, 15, 18, 20)] + [twist[i] for i in (0, 6, 11)]
         variances = () if m.estimator_type == 1 else tuple(diagonal)
         velocity = rotated(m.q, (m.vx, m.vy, m.vz))
-        return Taken(m.time_usec, *self._reprojected(m), velocity, tuple(m.q), variances, m.reset_counter, m.quality)
+        return Accepted(m.time_usec, *self._reprojected(m), velocity, tuple(m.q), variances, m.reset_counter, m.quality)
 
-    def _vision_position_estimate(self, m: Any) -> Taken:
+    def _vision_position_estimate(self, m: Any) -> Accepted:
         q = quaternion(matrix_from_euler(m.roll, m.pitch, m.yaw)).tolist()
         variances = tuple(m.covariance[i] for i in (0, 6, 11, 15, 18, 20))
-        return Taken(m.usec, *self._reprojected(m), None, tuple(q), variances, m.reset_counter, 0)
+        return Accepted(m.usec, *self._reprojected(m), None, tuple(q), variances, m.reset_counter, 0)
 
     def _reprojected(self, m: Any) -> Triple:
         latitude, longitude, height = self._origin

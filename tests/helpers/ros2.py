@@ -29,7 +29,7 @@ def health(t_ns: int = T0 + 9, mode: Mode = Mode.NOMINAL, resets: int = 0, dropp
         uptime_s=12.5,
         mode=mode,
         resets=resets,
-        reset_reason="gnss.position is believed again" if resets else None,
+        reset_reason="gnss.position: rejected for too long" if resets else None,
         outcomes=OutcomeCounts(fused=10, rejected=2),
         latency_ms=LatencyHealth(),
         sources={

@@ -136,7 +136,7 @@ def trace(folder: Path) -> str:
 def replayed_alike(file: Path, box: Path, payloads: list[bytes]) -> str:
     """How many of the states that a replay of the black box publishes are, byte for byte, those received live. Those
     that Zenoh dropped on their way are told. Raises Failed."""
-    from fusiond.app.replay.replay import Replay, Wants  # noqa: PLC0415
+    from fusiond.app.replay.replay import Replay, ReplayTask  # noqa: PLC0415
     from fusiond.config import load as config  # noqa: PLC0415 - installed by the check before
     from fusiond.messages.codec import encode  # noqa: PLC0415
     from fusiond_adapters.logs.merge import open_logs  # noqa: PLC0415
@@ -148,7 +148,7 @@ def replayed_alike(file: Path, box: Path, payloads: list[bytes]) -> str:
         again[message.t_ns] = encode(message, "json")
 
     logs = [str(path) for path in sorted(box.iterdir())]
-    Replay(settings, Wants(settings.publish.rate_hz, on_tick=[keep])).run(open_logs(logs, settings))
+    Replay(settings, ReplayTask(settings.publish.rate_hz, on_tick=[keep])).run(open_logs(logs, settings))
     live = {int(json.loads(payload)["t_ns"]): payload for payload in payloads}
     both = again.keys() & live.keys()
     other = sum(again[t_ns] != live[t_ns] for t_ns in both)

@@ -39,7 +39,7 @@ class Reader:
         self.is_connected: Callable[[], bool] = lambda: False  # whether the publisher knows of this reader
         self._came = Condition()
 
-    def take(self, sample: zenoh.Sample) -> None:
+    def receive(self, sample: zenoh.Sample) -> None:
         """From Zenoh's thread."""
         arrival = Arrival(time.monotonic_ns(), sample.payload.to_bytes())
         with self._came:
@@ -89,7 +89,7 @@ def reading(name: str, endpoint: str) -> Iterator[Reader]:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     reader = Reader()
-    with zenoh.open(config) as session, session.declare_subscriber(f"fusiond/{name}/state", reader.take):
+    with zenoh.open(config) as session, session.declare_subscriber(f"fusiond/{name}/state", reader.receive):
         reader.is_connected = lambda: any(True for _ in session.liveliness().get(f"fusiond/{name}/@alive/state"))
         yield reader
 

@@ -1,6 +1,6 @@
-"""The commands: a module for each, which holds its grammar (`fill`) and its action (`run`).
+"""The commands, one module for each: its arguments (`fill`) and its action (`run`).
 
-Only the module of the command that is called is imported: the daemon is up sooner without what only the others need.
+Only the module of the given command is imported, so that the daemon starts sooner.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ COMMANDS = {
     "run": "fuse the live inputs, and publish the state",
     "replay": "fuse recorded logs into a track",
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
-    "check": "say what a configuration is going to do, or what is wrong with it",
-    "mount": "find how the IMU is turned in the vehicle, from logs",
-    "simulate": "write the logs of a simulated drive, and the truth about it",
-    "demo": "play a bundled drive to a running fusiond, and explain what comes out",
+    "check": "explain what a configuration does, or what is wrong with it",
+    "mount": "estimate the mounting angles of the IMU from logs",
+    "simulate": "write the logs of a simulated drive and its truth",
+    "demo": "play a bundled drive to a running fusiond, and explain the result",
 }
 
 EXIT_CODES = "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 130 interrupted"

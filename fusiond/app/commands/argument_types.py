@@ -15,7 +15,7 @@ def positive(text: str) -> float:
 
 
 def rate(text: str) -> float:
-    """A rate of publications [Hz]."""
+    """A publication rate [Hz]."""
     value = _number(text)
     if not 0.001 <= value <= 1000:
         raise argparse.ArgumentTypeError(f"must lie between 0.001 and 1000 Hz, not {text}")
@@ -23,9 +23,9 @@ def rate(text: str) -> float:
 
 
 def seed(text: str) -> int:
-    """A whole number from 0."""
+    """A whole number, at least 0."""
     if not (text.isascii() and text.isdigit()):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 0")
     return int(text)
 
 

@@ -1,4 +1,4 @@
-"""fusiond check: what a configuration is going to do."""
+"""fusiond check: explains a configuration and its warnings."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from fusiond_adapters.mavlink.decoder import MavlinkDecoder
 
 
 def fill(parser: argparse.ArgumentParser) -> None:
-    """The grammar."""
+    """Define the arguments."""
     parser.epilog = "example:\n  fusiond check --config car.toml"
     parser.add_argument("--config", metavar="C.toml", required=True, help="configuration file")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """The action."""
+    """Run the command."""
     loaded = config.load(arguments.config)
     for link in loaded.mavlink:
         MavlinkDecoder(loaded, link)

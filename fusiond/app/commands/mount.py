@@ -1,37 +1,39 @@
-"""fusiond mount: how the IMU is turned in the vehicle."""
+"""fusiond mount: the mounting angles of the IMU."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-from fusiond.app import mounting
+from fusiond.app.mounting.report import text
+from fusiond.app.mounting.rotation import find
+from fusiond.app.mounting.windows import Gathering
 from fusiond.app.progress import shown
 from fusiond.config import load as config
 from fusiond.timeline.clock import Clock
 from fusiond_adapters.logs.merge import open_logs
 
 ABOUT = """\
-Find how the IMU is turned against forward-right-down, from the logs of a drive, and print the rotation_deg to configure:
-any rotation, upside down included. Run again with that configured, it tells what is left. The drive needs a minute or
-more, mostly forward, with pulling away, braking, and bends both ways. The configuration is not changed."""
+Solution the rotation of the IMU against forward-right-down from the logs of a drive, and print the rotation_deg to
+configure: any rotation, upside down included. With that configured, a second run shows the remaining rotation. The drive
+needs a minute or more, mostly forward, with pulling away, braking, and bends both ways. The configuration is not changed."""
 
 
 def fill(parser: argparse.ArgumentParser) -> None:
-    """The grammar."""
+    """Define the arguments."""
     parser.description, parser.epilog = ABOUT, "example:\n  fusiond mount --config car.toml drive.tlog drive.log"
     parser.add_argument("logs", metavar="LOG", nargs="+", help="as for replay")
     parser.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """The action."""
+    """Run the command."""
     loaded = config.load(arguments.config)
-    ((source, imu),) = loaded.imu.items()
-    logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), mounting.Gathering(loaded)
+    ((name, imu),) = loaded.imu.items()
+    logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), Gathering(loaded)
     progress = shown(logs, lambda: logs.bytes_read / logs.bytes_total, lambda: gathering.elapsed_ns, sys.stderr)
     for received in progress:
         measurement = clock.align(received)
         if measurement is not None:
             gathering.add(measurement)
-    print(mounting.text(mounting.find(gathering.windows(), imu.rotation_deg), source))
+    print(text(find(gathering.windows(), imu.rotation_deg), name))

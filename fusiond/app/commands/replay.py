@@ -1,4 +1,4 @@
-"""fusiond replay: recorded logs, fused."""
+"""fusiond replay: fuses recorded logs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from fusiond.errors import UsageError
 from fusiond_adapters.host import journal
 
 ABOUT = """\
-Fuse the logs of one drive as if they arrived now, in their order of receipt: late measurements are put where they
-belong in time. Prints a summary; the same inputs always give the same files, byte for byte."""
+Fuse the logs of one drive in their order of receipt, as in a live run: late measurements are put where they belong in
+time. Prints a summary; the same inputs always give the same files, byte for byte."""
 EXAMPLES = """\
 examples:
   fusiond replay --config car.toml drive.tlog drive.log --csv track.csv
@@ -26,16 +26,16 @@ examples:
   fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --window 10-30 --plot errors.png
       compare seconds 10 to 30 with a reference, and draw the errors
   fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --withhold gps0:12-22 --window 12-22
-      how far off is it after ten seconds without GNSS?
+      how large is the error after ten seconds without GNSS?
   fusiond replay --config car.toml drive.tlog drive.log --speed 1 --publish
-      publish over Zenoh all that `fusiond run` would, in real time: open `fusiond top` beside it
+      publish over Zenoh everything that `fusiond run` would, in real time: run `fusiond top` beside it
   fusiond replay --config car.toml drive.tlog drive.log --speed 1 --outputs
-      rehearse everything that the configuration turns on: ROS 2, Foxglove, Prometheus, ...
+      test everything that the configuration turns on: ROS 2, Foxglove, Prometheus, ...
 """
 
 
 def fill(parser: argparse.ArgumentParser) -> None:
-    """The grammar."""
+    """Define the arguments."""
     parser.description, parser.epilog = ABOUT, f"{EXAMPLES}\n{EXIT_CODES}"
     add = parser.add_argument
     add("logs", metavar="LOG", nargs="+", help=".tlog, .log (candump -L), .asc, .blf, .trc, ..., also .gz; or NAME=LOG")
@@ -44,7 +44,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
     add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
     add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
     add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
-    add("--stored", metavar="STATE.json", type=Path, help="begin with the stored state that the recorded run began with")
+    add("--stored", metavar="STATE.json", type=Path, help="start with the stored state that the recorded run started with")
     add("--mcap", metavar="OUT.mcap", type=Path, help="write everything published, for Foxglove (extra `mcap`)")
     add("--plot", metavar="OUT.png", type=Path, help="draw the track and, with --truth, its errors (extra `plot`)")
     add(
@@ -52,21 +52,21 @@ def fill(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE:START-STOP",
         action="append",
         default=[],
-        help="keep a source out between these seconds from the first event, such as gps0:12-22; may be repeated",
+        help="withhold a source between these seconds from the first event, such as gps0:12-22; may be repeated",
     )
     add("--rate", metavar="HZ", type=rate, help="publications per second; default: publish.rate_hz of the config")
     add("--speed", metavar="X", type=positive, help="replay at X times real time; default: as fast as possible")
-    add("--publish", action="store_true", help="publish over Zenoh, as configured, all that `fusiond run` publishes")
-    add("--outputs", action="store_true", help="feed every output that the configuration turns on, Zenoh among them")
+    add("--publish", action="store_true", help="publish over Zenoh, as configured, everything that `fusiond run` publishes")
+    add("--outputs", action="store_true", help="send to every output that the configuration turns on, including Zenoh")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """The action."""
+    """Run the command."""
     loaded = config.load(arguments.config)
     if arguments.window and not arguments.truth:
         raise UsageError("--window limits the comparison with a truth: give --truth as well")
     if arguments.publish or arguments.outputs:
-        journal.set_up(logging.WARNING)  # says when an output is lost
+        journal.set_up(logging.WARNING)  # reports the loss of an output
     options = Options(
         config=loaded,
         config_name=Path(arguments.config).name,

@@ -1,4 +1,4 @@
-"""fusiond simulate: the logs of a drive that never was."""
+"""fusiond simulate: writes the logs of a simulated drive."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from fusiond_adapters.logs.write import write_drive
 
 
 def fill(parser: argparse.ArgumentParser) -> None:
-    """The grammar."""
+    """Define the arguments."""
     parser.epilog = "example:\n  fusiond simulate --config configs/simulate-demo.toml --out drive"
     parser.add_argument("--config", metavar="S.toml", required=True, help="scenario file")
-    parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder to write to; made if need be")
-    parser.add_argument("--seed", metavar="N", type=seed, help="in place of the scenario's seed")
+    parser.add_argument("--out", metavar="DIR", required=True, type=Path, help="folder to write to; created if missing")
+    parser.add_argument("--seed", metavar="N", type=seed, help="instead of the scenario's seed")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """The action."""
+    """Run the command."""
     for path in write_drive(scenario.load(arguments.config), arguments.out, arguments.seed):
         print(f"{path}  {path.stat().st_size / 1e3:.0f} kB")

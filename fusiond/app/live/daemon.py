@@ -1,8 +1,8 @@
 """The daemon: `fusiond run`. Inputs, estimator and outputs, each in a thread of its own; the event loop supervises them.
 
-The estimator's thread also feeds systemd's watchdog and lets the heartbeats go out, so that both stop when it does. An
-input or output that fails takes nothing else down: see `supervisor`. The end is orderly: inputs first, then what they left
-is fused, recorded and published, then the outputs.
+The estimator's thread also feeds systemd's watchdog and enables the heartbeats, so that both stop when it does. The failure
+of an input or output stops nothing else: see `supervisor`. At the end the inputs stop first; then the frames that they left
+are fused, recorded and published; then the outputs stop.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from fusiond.config.toml import ConfigError
 from fusiond.filter.stored_state import to_text
 from fusiond.messages import EventMessage, HealthMessage, LatencyHealth, Message, OutputHealth, StateMessage
 from fusiond.messages.info import config_message, info_message
-from fusiond.messages.schedule import Surroundings
-from fusiond.ports.inputs import LiveInput, Receiver
-from fusiond.ports.outputs import Around, LiveOutput
+from fusiond.messages.schedule import IoHealth
+from fusiond.ports.inputs import InputContext, LiveInput
+from fusiond.ports.outputs import LiveOutput, OutputContext
 from fusiond_adapters.host import journal
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.host.systemd import Notifier, watchdog_s
 from fusiond_adapters.logs.black_box import Recorder
 from fusiond_adapters.registry import make_inputs, make_outputs
 
-POOL = 4  # threads: the estimator's, one that writes the stored state, two that wait for inputs and outputs
-REPORT_S = 10.0  # between two lines about losses, while there are any
+POOL = 4  # threads: the estimator's, one to write the stored state, two to wait for inputs and outputs
+REPORT_S = 10.0  # between two reports of losses in the log
 
 LEVEL = {"info": logging.INFO, "notice": logging.INFO, "warning": logging.WARNING, "critical": logging.CRITICAL}
 
@@ -46,10 +46,10 @@ StateSink = Callable[[StateMessage], None]
 
 
 class Daemon:
-    """One run. `sinks` take every published state, in the estimator's own thread; `outputs` are added to those of the
-    configuration, of which `zenoh=False` leaves out Zenoh; `load` reads the configuration anew for a reload.
+    """One run. `sinks` get every published state, in the estimator's thread; `outputs` are added to those of the
+    configuration; `zenoh=False` leaves out Zenoh; `load` reads the configuration again for a reload.
 
-    Raises ConfigError where the configuration does not fit its dialects, or an output lacks its extra.
+    Raises ConfigError if the configuration does not fit its dialects, or an output lacks its extra.
     """
 
     def __init__(
@@ -64,41 +64,43 @@ class Daemon:
     ) -> None:
         self.config = config
         self.clock = clock or HostClock()
-        self._state_file, stored = None, None
+        self._state_file, stored_state = None, None
         if config.state.file is not None:
             self._state_file = StateFile(config.path(config.state.file), config, self.clock.now_ns())
-            stored = self._state_file.stored
-        self.live = LiveEngine(config, self.clock.now_ns, self._publish, self._surroundings, stored=stored)
-        self._wake = Event()  # the estimator: there is something to do
+            stored_state = self._state_file.stored
+        self.live = LiveEngine(
+            config, self.clock.now_ns, self._publish, self._io_health, stored_state=stored_state
+        )
+        self._wake = Event()  # wakes the estimator
         self.inputs = Inputs(self._make_inputs(config), self._max_pause_s, self.stop)
-        made = make_outputs(config, Around(self.clock, self.inputs)) | {one.name: one for one in outputs}
+        made = make_outputs(config, OutputContext(self.clock, self.inputs)) | {one.name: one for one in outputs}
         if not zenoh:
             del made["zenoh"]
         self.outputs = Outputs(made.values(), self.clock.now_ns, self._introduction, self._max_pause_s)
         self.published = self.reloads = 0
         self.up = asyncio.Event()  # every input is prepared, and every output has been tried
         self.health: HealthMessage | None = None  # the latest
-        self.estimator = Estimator(self.live, self.inputs, self.clock, self._wake, self._after_turn)
+        self.estimator = Estimator(self.live, self.inputs, self.clock, self._wake, self._after_step)
         self._load, self._sinks = load, sinks
         self._stopping = Event()
-        self._over = asyncio.Event()  # the estimator has ended: there is no more to come
+        self._over = asyncio.Event()  # the estimator has ended
         self._recorder: Recorder | None = None
         self._mode: str | None = None
-        self._told: dict[str, int] = {}  # losses as last logged
+        self._logged: dict[str, int] = {}  # losses as last logged
         self._notifier = Notifier()
         self._feed_s = watchdog_s()
         self._next_feed_s = self._next_report_s = 0.0  # monotonic
 
     def stop(self) -> None:
-        """Ask for the end. From any thread."""
+        """Request the end. From any thread."""
         if not self._stopping.is_set():
             self._stopping.set()
             self._notifier.stopping()
         self.inputs.stop()
 
     async def run(self) -> None:
-        """Run until asked to stop. Raises OSError where the black box's folder cannot be made, ConfigError where the
-        configuration does not fit its DBC files: then nothing was ever said to be up."""
+        """Run until `stop` is called. Raises OSError if the black box's folder cannot be created, ConfigError if the
+        configuration does not fit its DBC files; readiness is then never reported."""
         self._open_recorder()
         if self._recorder and self._state_file and self._state_file.stored:
             self._recorder.add("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
@@ -127,7 +129,7 @@ class Daemon:
         log.info("ended: %s", self.status(), extra={"MESSAGE_ID": journal.ENDED})
 
     def _make_inputs(self, config: Config) -> dict[str, LiveInput[Any]]:
-        return make_inputs(config, Receiver(self.clock, self._wake.set, self._is_alive))
+        return make_inputs(config, InputContext(self.clock, self._wake.set, self._is_alive))
 
     def _is_alive(self) -> bool:
         return self.estimator.is_alive()
@@ -142,13 +144,13 @@ class Daemon:
             return
         self.up.set()
         self._notifier.ready(self.status())
-        parts = [source.about for source in self.inputs.values()] + [output.about for output in self.outputs.values()]
+        parts = [one.about for one in self.inputs.values()] + [one.about for one in self.outputs.values()]
         log.info("up: %s", ", ".join(parts), extra={"MESSAGE_ID": journal.STARTED})
 
     # --- The estimator
 
     async def _estimate(self, executor: ThreadPoolExecutor) -> None:
-        """Run the estimator to its end, then let the outputs send what they have."""
+        """Run the estimator to its end, then let the outputs send the rest."""
         try:
             await _in_thread(executor, self._run_estimator)
         finally:
@@ -168,8 +170,8 @@ class Daemon:
         self.inputs.join()
         self.estimator.finish()
 
-    def _after_turn(self) -> None:
-        """In the estimator's thread: nobody else feeds the watchdog."""
+    def _after_step(self) -> None:
+        """Called in the estimator's thread, which alone feeds the watchdog."""
         now_s = time.monotonic()
         if self._feed_s is not None and now_s >= self._next_feed_s:
             self._next_feed_s = now_s + self._feed_s / 2
@@ -181,7 +183,7 @@ class Daemon:
     # --- The stored state
 
     async def _keep_state(self, file: StateFile, executor: ThreadPoolExecutor) -> None:
-        """Store the newest state again and again, and at the end, in a thread: a disk may be slow."""
+        """Store the newest state periodically and at the end, in a thread: a disk may be slow."""
         over = False
         while not over:
             await _first(self._over, self.config.state.every_s)
@@ -190,10 +192,10 @@ class Daemon:
             if newest is not None:
                 await asyncio.get_running_loop().run_in_executor(executor, file.write, newest)
 
-    # --- What goes out
+    # --- Publication
 
     def _publish(self, message: Message) -> None:
-        """Leave a message with every output, and log what people may want to know. The engine's sink."""
+        """The engine's sink: pass a message to every output, and log events."""
         if isinstance(message, StateMessage):
             for sink in self._sinks:
                 sink(message)
@@ -206,64 +208,65 @@ class Daemon:
         self.outputs.put(message)
 
     def _introduction(self) -> list[Message]:
-        """What is sent once."""
+        """The messages sent once, to every output that opens."""
         return [info_message(self.config, self.live.engine.fusion), config_message(self.config)]
 
-    # --- Watching it, reloading it
+    # --- Status, reload
 
     def status(self) -> str:
-        """The state of things in one line."""
+        """The status in one line."""
         latency = self.outputs.handed_over.report()
         late = "" if latency is None else f", latency p50 {latency.p50:g} ms p99 {latency.p99:g} ms"
         return f"{self._mode or 'no data yet'}, {self.live.offered} measurements, {self.published} published{late}"
 
-    def _surroundings(self) -> Surroundings:
-        """What the health tells of inputs, outputs and latency."""
+    def _io_health(self) -> IoHealth:
+        """Health of inputs and outputs, and latencies, for the health message."""
         outputs = self.outputs.health()
-        if box := self._recorder:
-            notes = {"error": box.error} if box.error else {}
-            outputs["record"] = OutputHealth(offered=box.written + box.lost, dropped=box.lost, counts={}, notes=notes)
+        if recorder := self._recorder:
+            notes = {"error": recorder.error} if recorder.error else {}
+            offered = recorder.written + recorder.lost
+            outputs["record"] = OutputHealth(offered=offered, dropped=recorder.lost, counts={}, notes=notes)
         if file := self._state_file:
             outputs["state"] = file.health(self.live.engine.fusion.hot_start())
         latency = LatencyHealth(fused=self.live.to_fusion.report(), published=self.outputs.handed_over.report())
-        return Surroundings(latency, self.inputs.health(), outputs)
+        return IoHealth(latency, self.inputs.health(), outputs)
 
     def losses(self) -> dict[str, int]:
-        """What was lost so far, by kind; all of it is counted, none of it is silent."""
-        found = {f"{key} frames dropped": source.inbox.dropped for key, source in self.inputs.items()}
-        found |= {f"{key} frames lost before receipt": source.inbox.missed for key, source in self.inputs.items()}
+        """Counts of everything lost so far, by kind."""
+        found = {f"{key} frames dropped": one.inbox.dropped for key, one in self.inputs.items()}
+        found |= {f"{key} frames lost before receipt": one.inbox.missed for key, one in self.inputs.items()}
         found |= {f"{name} messages dropped": dropped for name, dropped in self.outputs.dropped().items()}
         found["stamps moved"] = self.live.moved
         found["states not stored"] = self._state_file.lost if self._state_file else 0
         return found | {"records lost": self._recorder.lost if self._recorder else 0}
 
     def _report_losses(self) -> None:
-        """One line for what was lost since the last one."""
+        """Log the losses since the last report."""
         losses = self.losses()
-        new = {name: count - self._told.get(name, 0) for name, count in losses.items() if name != "stamps moved"}
-        told = ", ".join(f"{count} {name}" for name, count in new.items() if count)
-        if told:
+        new = {name: count - self._logged.get(name, 0) for name, count in losses.items() if name != "stamps moved"}
+        text = ", ".join(f"{count} {name}" for name, count in new.items() if count)
+        if text:
             disks = (("black box", self._recorder), ("state file", self._state_file))
             why = "".join(f"; {name}: {disk.error}" for name, disk in disks if disk and disk.error)
-            log.warning("in the last %g s: %s%s", REPORT_S, told, why, extra={"MESSAGE_ID": journal.DATA_LOST})
-        self._told = losses
+            log.warning("in the last %g s: %s%s", REPORT_S, text, why, extra={"MESSAGE_ID": journal.DATA_LOST})
+        self._logged = losses
 
     def reload(self) -> None:
-        """Take from the configuration file what can change live; with anything else changed, refuse all of it."""
+        """Apply the changes of the configuration file that can be made live; refuse all if there is any other change."""
         if self._load is None:
             return
         self._notifier.reloading()
         try:
             new = self._load()
-            for source in self._make_inputs(new).values():  # raises what is wrong with it, before anything is changed
-                source.prepare()
+            for one in self._make_inputs(new).values():  # raises any error before anything is changed
+                one.prepare()
             found = changes(self.config, new)
             if found.refused:
                 log.error("reload refused: a restart is needed to change %s", ", ".join(found.refused))
             else:
                 self._adopt(new, found.taken)
-                told = ", ".join(found.taken) or "nothing has changed"
-                log.info("reloaded: %s", told, extra={"MESSAGE_ID": journal.RELOADED})
+                text = ", ".join(found.taken) or "nothing has changed"
+                log.info("reloaded: %s", text, extra={"MESSAGE_ID": journal.RELOADED})
         except (ConfigError, OSError) as error:
             log.error("reload refused: %s", error)
         self.reloads += 1
@@ -277,7 +280,7 @@ class Daemon:
             last = self._recorder
             self._open_recorder()
             if last:
-                self.estimator.ask(last.close)  # which may be adding to it now
+                self.estimator.ask(last.close)  # the estimator may be adding to it now
 
     def _open_recorder(self) -> None:
         section, self._recorder = self.config.record, None
@@ -291,7 +294,7 @@ async def _in_thread(executor: ThreadPoolExecutor, call: Callable[[], None]) -> 
 
 
 async def _first(event: asyncio.Event, seconds: float) -> None:
-    """Wait for an event, or until a time has passed."""
+    """Wait for an event, at most for a time."""
     try:
         async with asyncio.timeout(seconds):
             await event.wait()

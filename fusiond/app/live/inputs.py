@@ -13,13 +13,13 @@ from fusiond.ports.inputs import LiveInput
 
 
 class Inputs(Mapping[str, LiveInput[Any]]):
-    """The inputs of one run, by kind and name. `max_pause_s` limits the pauses before one that was lost is opened again;
-    `on_fault` is called, in its thread, when one cannot be prepared: see `fault`."""
+    """The inputs of one run, by section and name. `max_pause_s` limits the pauses before a lost input is opened again;
+    `on_fault` is called in an input's thread when it cannot be prepared: see `fault`."""
 
     def __init__(
         self, inputs: Mapping[str, LiveInput[Any]], max_pause_s: Callable[[], float], on_fault: Callable[[], None]
     ) -> None:
-        self.fault: BaseException | None = None  # what went wrong when one was prepared, such as a ConfigError
+        self.fault: BaseException | None = None  # the exception of one that could not be prepared, such as a ConfigError
         self._inputs, self._max_pause_s, self._on_fault = dict(inputs), max_pause_s, on_fault
         self._over = Event()
         self._stops = {key: Event() for key in self._inputs}  # ends the present session of an input
@@ -35,60 +35,60 @@ class Inputs(Mapping[str, LiveInput[Any]]):
     def __len__(self) -> int:
         return len(self._inputs)
 
-    # --- Their sessions
+    # --- Sessions
 
     def start(self) -> None:
-        """Prepare and open all of them, each in a thread of its own."""
+        """Prepare and open all inputs, each in a thread of its own."""
         for thread in self._threads:
             thread.start()
 
     def wait_until_prepared(self) -> None:
-        """Wait until each is prepared, or could not be."""
+        """Wait until each is prepared or could not be prepared."""
         for event in self._prepared.values():
             event.wait()
 
     def stop(self) -> None:
-        """Close all of them. From any thread."""
+        """Close all inputs. From any thread."""
         self._over.set()
         for event in self._stops.values():
             event.set()
 
     def join(self) -> None:
-        """Wait for their end, after `stop`."""
+        """Wait until all have ended, after `stop`."""
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join()
 
     def configure(self, config: Config, keys: Sequence[str]) -> None:
-        """Take from a configuration what changed of it, by key, and open anew what that concerns. Raises ConfigError."""
+        """Use a new configuration, of which `keys` changed: the inputs concerned are opened again. Raises ConfigError."""
         rates = any(key.partition(".")[0] in sensor_tables() for key in keys)
-        for name, source in self._inputs.items():
+        for name, one in self._inputs.items():
             if any(key.startswith(f"{name}.") for key in keys) or (rates and name.startswith("mavlink.")):
-                source.configure(config)
+                one.configure(config)
                 self._stops[name].set()
 
     def _keep(self, key: str) -> None:
-        source = self._inputs[key]
+        one = self._inputs[key]
 
         def session() -> None:
             stop = self._stops[key] = Event()
-            if not self._over.is_set():  # it may have been set before there was this event
-                source.session(stop)
+            if not self._over.is_set():  # it may have been set before this event existed
+                one.session(stop)
 
         try:
-            source.prepare()
-        except Exception as fault:  # of the configuration, or a driver's: the daemon ends, and raises it
+            one.prepare()
+        except Exception as fault:  # of the configuration or a driver: the daemon ends and raises it
             self.fault = fault
             self._on_fault()
         finally:
             self._prepared[key].set()
-        keep_open(source, session, self._over, self._max_pause_s)
+        keep_open(one, session, self._over, self._max_pause_s)
 
-    # --- What became of the frames
+    # --- Counts
 
     def health(self) -> dict[str, InputHealth]:
-        """As it is published."""
+        """The published health of each input."""
         return {
-            key: InputHealth(received=source.inbox.received, dropped=source.inbox.dropped, counts=source.counts())
-            for key, source in self._inputs.items()
+            key: InputHealth(received=one.inbox.received, dropped=one.inbox.dropped, counts=one.counts())
+            for key, one in self._inputs.items()
         }

@@ -1,9 +1,8 @@
-"""The engine live: frames from the inboxes, put into one order, decoded, fused, recorded; ticks made when they are due.
+"""The engine live: frames from the inboxes are put into one order, decoded, fused and recorded; ticks are made when due.
 
-One order. Receive stamps ascend strictly, by a microsecond at the least (that is what the logs hold), over all inputs
-and ticks: a frame that was overtaken on its way here, by a tick or by a frame of another input, counts as received just
-after. So the recording's stamps tell the whole order, and its replay makes the same ticks of it. How many stamps were
-moved, and how far, is counted.
+Receive stamps increase strictly over all inputs and ticks, by at least a microsecond (the resolution of the logs). A frame
+that was overtaken by a tick or by a frame of another input counts as received just after it. So the recorded stamps define
+the complete order, and a replay makes the same ticks. The number of moved stamps and the largest move are counted.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages import Message
 from fusiond.messages.latency import RecentLatencies
-from fusiond.messages.schedule import Surroundings
+from fusiond.messages.schedule import IoHealth
+from fusiond.units import MICROSECOND
 
-MICROSECOND = 1_000  # ns
-MAX_FRAMES = 256  # taken at once
-MOVED_NS = 100 * MICROSECOND  # less is only to tell apart frames that were read at once
+MAX_FRAMES = 256  # processed in one step
+MOVED_NS = 100 * MICROSECOND  # smaller moves only separate frames that were read together
 
 
-class Source(Protocol):
-    """Whose frames these are: see fusiond.ports.inputs.LiveInput."""
+class FrameInput(Protocol):
+    """The part of an input that is used here: see fusiond.ports.inputs.LiveInput."""
 
     name: str
     file: str
@@ -37,51 +36,51 @@ class Source(Protocol):
 
 
 class LiveEngine:
-    """Engine and inputs of a running daemon. `now` reads the time line; `sink` takes whatever is to go out;
-    `surroundings` tells the health of the shell; `record` takes kind of file, stamp, bytes; `stored` is for a hot start."""
+    """The engine of a running daemon. `now` reads the clock; `sink` gets every message; `io_health` returns the health of
+    inputs and outputs; `record` gets kind of file, stamp and bytes of each frame; `stored_state` is for a hot start."""
 
     def __init__(
         self,
         config: Config,
         now: Callable[[], int],
         sink: Callable[[Message], None],
-        surroundings: Callable[[], Surroundings] = Surroundings,
+        io_health: Callable[[], IoHealth] = IoHealth,
         record: Callable[[str, int, bytes], None] | None = None,
-        stored: StoredState | None = None,
+        stored_state: StoredState | None = None,
     ) -> None:
-        self.engine = Engine(config, sink, surroundings=surroundings, stored=stored)
+        self.engine = Engine(config, sink, io_health=io_health, stored_state=stored_state)
         self.record = record
-        self.moved = self.most_moved_ns = 0  # stamps, see above
+        self.moved = self.max_moved_ns = 0  # stamps: number, and largest move
         self.offered = 0  # measurements given to the fusion
-        self.to_fusion = RecentLatencies()  # from receipt to having been fused
+        self.to_fusion = RecentLatencies()  # from receipt to the end of the fusion
         self._now = now
         self._last_ns = 0
-        self._frames: list[tuple[int, Source, Any]] = []  # received, but not taken yet
+        self._frames: list[tuple[int, FrameInput, Any]] = []  # received, but not processed yet
 
     @property
     def next_tick_ns(self) -> int | None:
         """When the next tick is due; None before the first event."""
         return self.engine.next_tick_ns
 
-    def step(self, sources: Mapping[str, Source], *, give_way: bool = False) -> bool:
-        """Take what the inboxes hold, and make the ticks that are due.
+    def step(self, inputs: Mapping[str, FrameInput], *, give_way: bool = False) -> bool:
+        """Process the frames in the inboxes, and make the ticks that are due.
 
-        With `give_way` it ends after a tick of which only the state has gone out, so that this reaches its readers before
-        the work on the other messages begins: they are left to `Engine.flush`, and frames received after it to the next
-        step. So are frames beyond the first MAX_FRAMES: however great the load, whoever calls this comes round. Returns
-        whether frames are left.
+        With `give_way` it returns after a tick of which only the state has been published, so that the state reaches its
+        readers before the work on the other messages begins: they are left to `Engine.flush`, and later frames to the next
+        step. So are frames beyond the first MAX_FRAMES: the caller gets control back under any load. Returns whether frames
+        are left.
         """
         self.engine.flush()
         frames = self._frames
-        if len(frames) < MAX_FRAMES:  # the others may wait where they are bounded
-            frames += [(t_ns, source, item) for source in sources.values() for t_ns, item in source.inbox.take()]
+        if len(frames) < MAX_FRAMES:  # the others wait in the inboxes, which are bounded
+            frames += [(t_ns, one, item) for one in inputs.values() for t_ns, item in one.inbox.take()]
             frames.sort(key=itemgetter(0))
-        for number, (t_ns, source, item) in enumerate(frames):
+        for number, (t_ns, one, item) in enumerate(frames):
             if number == MAX_FRAMES or (give_way and self._tick_before(t_ns)):
                 self._frames = frames[number:]
                 return True
-            self._take(self._ordered(t_ns), source, item)
-            if give_way and self.engine.unfinished:  # a tick that has waited for this frame
+            self._feed_frame(self._ordered(t_ns), one, item)
+            if give_way and self.engine.unfinished:  # a tick that waited for this frame
                 self._frames = frames[number + 1 :]
                 return True
         self._frames = []
@@ -93,7 +92,7 @@ class LiveEngine:
         return False
 
     def _tick_before(self, t_ns: int) -> bool:
-        """Make the tick that is due before an instant; whether there is one."""
+        """Make the tick that is due before an instant. Returns whether there is one."""
         due = self.engine.next_tick_ns
         if due is None or due >= t_ns:
             return False
@@ -101,31 +100,31 @@ class LiveEngine:
         return True
 
     def _elapse(self, t_ns: int) -> None:
-        """Make the ticks up to an instant; whatever comes now was received after it."""
+        """Make the ticks up to an instant. Every later frame counts as received after it."""
         self.engine.elapse(t_ns)
         self._last_ns = max(self._last_ns, t_ns // MICROSECOND * MICROSECOND)
 
     def _ordered(self, t_ns: int) -> int:
-        """The stamp under which a frame counts as received."""
+        """The receive stamp of a frame in the strict order."""
         whole = t_ns // MICROSECOND * MICROSECOND
         if whole <= self._last_ns:
             self.moved += self._last_ns - whole > MOVED_NS
-            self.most_moved_ns = max(self.most_moved_ns, self._last_ns - whole)
+            self.max_moved_ns = max(self.max_moved_ns, self._last_ns - whole)
             whole = self._last_ns + MICROSECOND
         self._last_ns = whole
         return whole
 
-    def _take(self, t_ns: int, source: Source, item: Any) -> None:
+    def _feed_frame(self, t_ns: int, frame_input: FrameInput, item: Any) -> None:
         usable = 0
-        for event in source.decode(item, t_ns):
+        for event in frame_input.decode(item, t_ns):
             receipt = self.engine.feed(event)
             if receipt is not None:
                 self.offered += 1
                 usable += receipt.refusal is not Outcome.INVALID
         if usable:
-            self.engine.fusion.history.apply_rows()  # now, so that a tick finds it done
+            self.engine.fusion.history.apply_rows()  # now, so that a tick need not do it
             late_ns = max(0, self._now() - t_ns)
             for _ in range(usable):
                 self.to_fusion.add(late_ns)
         if self.record:
-            self.record(source.file, t_ns, source.record(item, t_ns))
+            self.record(frame_input.file, t_ns, frame_input.record(item, t_ns))

@@ -1,4 +1,4 @@
-"""The daemon as a process: its signals, and when Python may switch threads and collect garbage."""
+"""The daemon as a process: signals, thread switching and garbage collection."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import sys
 
 from fusiond.app.live.daemon import Daemon
 
-SWITCH_S = 0.0005  # threads that want to run wait no longer than this for each other; Python's own 5 ms would be felt
+SWITCH_S = 0.0005  # longest wait of a thread for another; Python's default of 5 ms would delay states
 
 
 async def serve(daemon: Daemon) -> None:
-    """Run a daemon as the process's only task, under its signals: SIGTERM and SIGINT end it, SIGHUP reloads."""
+    """Run a daemon as the process's only task: SIGTERM and SIGINT end it, SIGHUP reloads."""
     loop = asyncio.get_running_loop()
     for number, action in ((signal.SIGTERM, daemon.stop), (signal.SIGINT, daemon.stop), (signal.SIGHUP, daemon.reload)):
         loop.add_signal_handler(number, action)
@@ -27,8 +27,8 @@ async def serve(daemon: Daemon) -> None:
 
 
 async def _tidy(daemon: Daemon) -> None:
-    """Once it is up: keep the garbage collector from going through all modules again and again, for 30 ms each time, and
-    from working between an instant and its state: the estimator sees to it."""
+    """Once it is up, exclude the modules from garbage collection, which would take 30 ms each time, and turn off automatic
+    collection, which would delay states: the estimator's thread collects instead."""
     await daemon.up.wait()
     gc.collect()
     gc.freeze()

@@ -1,1 +1,1 @@
-"""Replay of recorded drives, and what is reported of them."""
+"""Replay of recorded drives, and its reports."""

@@ -1,7 +1,7 @@
 """Outputs attached to a replay: those of a live run, so that a dashboard or a ROS node can be rehearsed with a log.
 
-They are the very same, but a replay waits for them: where an outbox is full it stands still until there is room, up to
-PATIENCE_S, so that nothing is lost however fast it goes. What is lost after that is counted, and told at the end.
+They are the same, but a replay waits for them: if an outbox is full, it pauses until there is room, up to PATIENCE_S, so
+that nothing is lost at any speed. Messages lost after that are counted, and reported at the end.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from fusiond.engine import Engine
 from fusiond.errors import OutputError
 from fusiond.messages import LatencyHealth, Message
 from fusiond.messages.info import config_message, info_message
-from fusiond.messages.schedule import Surroundings
-from fusiond.ports.outputs import Around, LiveOutput
+from fusiond.messages.schedule import IoHealth
+from fusiond.ports.outputs import LiveOutput, OutputContext
 from fusiond_adapters.registry import make_outputs
 from fusiond_adapters.zenoh.output import ZenohOutput
 
-PATIENCE_S = 10.0  # for an output that takes nothing
+PATIENCE_S = 10.0  # longest wait for an output that takes no message
 
 log = logging.getLogger("fusiond")
 
@@ -41,8 +41,8 @@ def attachable(config: Config) -> tuple[Config, list[str]]:
 
 
 class Attached:
-    """The outputs of one replay: Zenoh, or with `everything` all that the configuration turns on. Raises ConfigError where
-    one lacks its extra."""
+    """The outputs of one replay: Zenoh, or with `everything` all that the configuration turns on. Raises ConfigError if one
+    lacks its extra."""
 
     def __init__(self, config: Config, pacer: Pacer | None, *, everything: bool) -> None:
         self.warnings: list[str] = []
@@ -52,7 +52,7 @@ class Attached:
         made: list[LiveOutput]
         if everything:
             config, self.warnings = attachable(config)
-            made = list(make_outputs(config, Around(clock, {})).values())
+            made = list(make_outputs(config, OutputContext(clock, {})).values())
         else:
             made = [ZenohOutput(config)]
         self.outputs = Outputs(made, clock.now_ns, self._introduction, self._max_pause_s, PATIENCE_S)
@@ -63,17 +63,17 @@ class Attached:
         return self._engine
 
     def put(self, message: Message) -> None:
-        """Leave a message with every output: an engine's sink."""
+        """The engine's sink: put a message into every outbox."""
         self.outputs.put(message)
 
-    def surroundings(self) -> Surroundings:
-        """What the health says of the outputs; latencies where there is a pace to keep."""
+    def io_health(self) -> IoHealth:
+        """Health of the outputs; latencies only if the replay is paced."""
         latency = LatencyHealth(published=self.outputs.handed_over.report() if self._paced else None)
-        return Surroundings(latency, {}, self.outputs.health())
+        return IoHealth(latency, {}, self.outputs.health())
 
     @contextmanager
     def opened(self, engine: Engine) -> Iterator[None]:
-        """All of them are open inside the block, and have sent what they had at its end. Raises OutputError."""
+        """Inside the block all outputs are open; at its end they have sent all their messages. Raises OutputError."""
         self._engine = engine
         for warning in self.warnings:
             log.warning("%s", warning)
@@ -88,7 +88,7 @@ class Attached:
             self.outputs.join()
         for name, count in self.outputs.unsent().items():
             if count:
-                why = self.outputs.failures.get(name, f"it took nothing for {PATIENCE_S:g} s")
+                why = self.outputs.failures.get(name, f"it accepted nothing for {PATIENCE_S:g} s")
                 self.warnings.append(f"{name}: {count} messages were lost: {why}")
 
     def _introduction(self) -> list[Message]:

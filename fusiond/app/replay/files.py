@@ -1,4 +1,4 @@
-"""The files around a replay: what it reads besides the logs, and what every message is written to."""
+"""The files of a replay besides the logs: stored state and truth to read, track and MCAP to write."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from fusiond.app.replay.comparison import Errors, Truth, TruthError, TruthRow, parse_truth
+from fusiond.app.replay.comparison import Errors
+from fusiond.app.replay.truth import Truth, TruthError, TruthSample, parse_truth
 from fusiond.app.state_file import read_state
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
@@ -17,11 +18,11 @@ from fusiond.filter.stored_state import StoredState, StoredStateError, check
 from fusiond.messages import Message, StateMessage, csv_header, csv_row
 from fusiond_adapters.logs.file import LogError
 
-# --- Read
+# --- Input
 
 
 def stored_state(path: Path, config: Config) -> StoredState:
-    """The stored state that a recording began with. Raises LogError."""
+    """The stored state that a recording started with. Raises LogError."""
     try:
         stored = read_state(path)
         if stored is None:
@@ -33,13 +34,13 @@ def stored_state(path: Path, config: Config) -> StoredState:
 
 
 def truth_of(path: Path) -> Truth:
-    """A reference track, after a first pass in which every fault would show. Raises TruthError."""
+    """A reference track; a first pass detects any error in the file. Raises TruthError."""
     for _ in _read_truth(path):
         pass
     return Truth(_read_truth(path))
 
 
-def _read_truth(path: Path) -> Iterator[TruthRow]:
+def _read_truth(path: Path) -> Iterator[TruthSample]:
     opener = gzip.open if path.suffix.lower() == ".gz" else open
     try:
         with opener(path, "rt", encoding="utf-8") as file:
@@ -47,17 +48,17 @@ def _read_truth(path: Path) -> Iterator[TruthRow]:
     except UnicodeDecodeError as error:
         raise TruthError(f"{path}: is not UTF-8 text") from error
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise TruthError(f"{path}: is no sound gzip file: {error}") from error
+        raise TruthError(f"{path}: is not a valid gzip file: {error}") from error
     except OSError as error:
         raise TruthError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-# --- Written
+# --- Output
 
 
 @contextmanager
 def delivering(path: Path) -> Iterator[None]:
-    """Inside the block an OSError is told as an OutputError that names the file."""
+    """Inside the block an OSError becomes an OutputError that names the file."""
     try:
         yield
     except OSError as error:
@@ -65,7 +66,7 @@ def delivering(path: Path) -> Iterator[None]:
 
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Whether files can be written, found before the work begins. Raises UsageError, OutputError."""
+    """Check before the work begins whether files can be written. Raises UsageError, OutputError."""
     read = {path.resolve() for path in inputs}
     for path in outputs:
         if path.resolve() in read:
@@ -75,19 +76,19 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 
 def csv_file(path: Path, stack: ExitStack) -> Callable[[StateMessage, Errors | None], None]:
-    """Opens a track for as long as the stack; returns what writes a row of it. Raises OutputError."""
+    """Open a track until the stack closes; returns a function that writes a line. Raises OutputError."""
     with delivering(path):
         file = stack.enter_context(path.open("w", encoding="ascii", newline="\n"))
         file.write(csv_header() + "\n")
 
-    def write_row(state: StateMessage, _: Errors | None) -> None:
+    def write_line(state: StateMessage, _: Errors | None) -> None:
         file.write(csv_row(state) + "\n")
 
-    return write_row
+    return write_line
 
 
 def mcap_file(path: Path, config: Config, stack: ExitStack) -> Callable[[Message], None]:
-    """Opens an MCAP file for as long as the stack; returns what writes a message. Raises UsageError, OutputError."""
+    """Open an MCAP file until the stack closes; returns a function that writes a message. Raises UsageError, OutputError."""
     try:
         from fusiond_adapters.foxglove.converter import Converter  # noqa: PLC0415 - needs the extra `mcap`
         from fusiond_adapters.mcap import McapFile  # noqa: PLC0415
@@ -109,17 +110,17 @@ def mcap_file(path: Path, config: Config, stack: ExitStack) -> Callable[[Message
 
 
 def short_names(paths: Iterable[str]) -> dict[str, str]:
-    """File names that stand for paths in the summary; alike ones are numbered."""
+    """File names for the paths in the summary; equal names are numbered."""
     names: dict[str, str] = {}
     for path in paths:
         name = Path(path).name
-        alike = sum(Path(other).name == name for other in names)
-        names[path] = f"{name} ({alike + 1})" if alike else name
+        same = sum(Path(other).name == name for other in names)
+        names[path] = f"{name} ({same + 1})" if same else name
     return names
 
 
 def with_short_names(text: str, names: dict[str, str]) -> str:
-    """A text with the names in place of the paths."""
+    """A text with the names instead of the paths."""
     for path, name in names.items():
         text = text.replace(path, name)
     return text

@@ -1,4 +1,4 @@
-"""Intervals of a drive in seconds from its first event, and the sources withheld in them, as given on the command line."""
+"""Arguments of the command line: intervals in seconds from the first event, and sources withheld in them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 from fusiond.config.schema import Config
 from fusiond.errors import UsageError
+from fusiond.units import nanoseconds
 
-SECOND = 1_000_000_000  # ns
 INTERVAL = re.compile(r"(\d+(?:\.\d*)?)-(\d+(?:\.\d*)?)")
 
 
 class Withheld(NamedTuple):
-    """Sources kept out from `start_ns` to before `stop_ns`, counted from the first event's receipt."""
+    """Sources withheld from `start_ns` until before `stop_ns`, counted from the first event's receipt."""
 
     sources: frozenset[str]
     start_ns: int
@@ -24,13 +24,12 @@ def parse_interval(text: str) -> tuple[float, float]:
     """`START-STOP` in seconds. Raises UsageError."""
     found = INTERVAL.fullmatch(text)
     if not found or not float(found[1]) < float(found[2]):
-        raise UsageError(f"'{text}' is no interval; give START-STOP in seconds from the first event, such as 12-22")
+        raise UsageError(f"'{text}' is not an interval; give START-STOP in seconds from the first event, such as 12-22")
     return float(found[1]), float(found[2])
 
 
 def parse_withheld(text: str, config: Config) -> Withheld:
-    """`SOURCE:START-STOP`; the source is a stream by its full name, or a receiver with all its streams. Raises
-    UsageError."""
+    """`SOURCE:START-STOP`; SOURCE is the full name of a source, or of a sensor with all its sources. Raises UsageError."""
     name, colon, interval = text.partition(":")
     if not colon:
         raise UsageError(f"--withhold {text}: give SOURCE:START-STOP, such as gps0:12-22")
@@ -39,4 +38,4 @@ def parse_withheld(text: str, config: Config) -> Withheld:
         known = ", ".join(dict.fromkeys([*config.gnss, *config.sources()]))
         raise UsageError(f"--withhold {text}: there is no source '{name}'; configured: {known}")
     start_s, stop_s = parse_interval(interval)
-    return Withheld(sources, round(start_s * SECOND), round(stop_s * SECOND))
+    return Withheld(sources, nanoseconds(start_s), nanoseconds(stop_s))

@@ -1,4 +1,4 @@
-"""One `fusiond replay`: the logs and files that it reads, the files and outputs that it feeds, around a replay."""
+"""One `fusiond replay`: a replay with its logs, files and outputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fusiond.app.replay.files import (
 )
 from fusiond.app.replay.intervals import Withheld
 from fusiond.app.replay.pacer import Pacer
-from fusiond.app.replay.replay import WHOLE, Replay, Wants
+from fusiond.app.replay.replay import WHOLE, Replay, ReplayTask
 from fusiond.app.replay.summary import Summary, to_json
 from fusiond.app.replay.trace import Trace
 from fusiond.config.schema import Config
@@ -52,38 +52,38 @@ class Options:
     rate_hz: float | None = None  # default: the configuration's
     speed: float | None = None  # default: as fast as possible
     publish: bool = False  # over Zenoh
-    outputs: bool = False  # over everything that the configuration turns on
+    outputs: bool = False  # to every output that the configuration turns on
     share: Callable[[int], float] | None = None  # part done by the time passed [ns], for the bar; default: bytes read
 
 
 def replay(options: Options) -> Summary:
-    """Replay logs as asked for, and write what was asked for.
+    """Replay logs, and write the requested files.
 
     Raises ConfigError, LogError, TruthError, UsageError, OutputError.
     """
     config, logs = options.config, open_logs(options.logs, options.config)
     pacer = Pacer(options.speed) if options.speed else None
-    wants = Wants(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)
-    wants.stored = stored_state(options.stored, config) if options.stored else None
-    wants.truth = truth_of(options.truth) if options.truth else None
+    task = ReplayTask(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)
+    task.stored_state = stored_state(options.stored, config) if options.stored else None
+    task.truth = truth_of(options.truth) if options.truth else None
     trace = Trace() if options.plot else None
     if trace:
-        wants.on_tick.append(trace.add_tick)
-        wants.on_receipt.append(trace.add_receipt)
+        task.on_tick.append(trace.add_tick)
+        task.on_receipt.append(trace.add_receipt)
     attached_warnings: list[str] = []
     with ExitStack() as stack:
-        _open_files(options, wants, stack)
+        _open_files(options, task, stack)
         if options.publish or options.outputs:
             from fusiond.app.replay.attached import Attached  # noqa: PLC0415 - Zenoh is slow to import
 
             attached = Attached(config, pacer, everything=options.outputs)
             attached_warnings = attached.warnings
-            wants.on_message.append(attached.put)
-            wants.surroundings = attached.surroundings
-            run = Replay(config, wants)
+            task.on_message.append(attached.put)
+            task.io_health = attached.io_health
+            run = Replay(config, task)
             stack.enter_context(attached.opened(run.engine))
         else:
-            run = Replay(config, wants)
+            run = Replay(config, task)
         share = options.share or (lambda _: logs.bytes_read / logs.bytes_total)
         run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr))
     summary = _summary(options, run, logs, attached_warnings)
@@ -99,25 +99,25 @@ def replay(options: Options) -> Summary:
     return summary
 
 
-def _open_files(options: Options, wants: Wants, stack: ExitStack) -> None:
-    """Open what every tick goes to; what cannot be written is found before the work begins."""
-    written = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
-    read = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
-    check_outputs(written, read)
+def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
+    """Open the files of the ticks. A file that cannot be written is detected before the work begins."""
+    outputs = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
+    inputs = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
+    check_outputs(outputs, inputs)
     if options.plot and importlib.util.find_spec("matplotlib") is None:
         raise UsageError("--plot needs the extra plot: pip install 'fusiond[plot]'")
     if options.csv:
-        wants.on_tick.append(csv_file(options.csv, stack))
+        task.on_tick.append(csv_file(options.csv, stack))
     if options.mcap:
-        wants.on_message.append(mcap_file(options.mcap, options.config, stack))
+        task.on_message.append(mcap_file(options.mcap, options.config, stack))
 
 
 def _summary(options: Options, run: Replay, logs: LogSet, attached_warnings: Sequence[str]) -> Summary:
-    """What came out. Raises LogError where nothing went in."""
+    """The summary. Raises LogError if no event was read."""
     names = short_names(logs.counts)
     if run.first_ns is None:
-        met = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())
-        raise LogError(f"nothing in the logs that the configuration asks for ({met})")
+        found = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())
+        raise LogError(f"nothing in the logs that the configuration asks for ({found})")
     warnings = [with_short_names(warning, names) for warning in logs.warnings]
     summary = run.summary(options.config_name, {names[path]: counts for path, counts in logs.counts.items()}, warnings)
     if options.stored and (verdict := run.fusion.hot_start()) is not Verdict.USED:

@@ -1,15 +1,16 @@
-"""How fast a replay goes, and the clock that its outputs read."""
+"""The speed of a replay, and the clock of its outputs."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
+from fusiond.units import SECOND
 from fusiond_adapters.host.clock import HostClock
 
 
 class Pacer:
-    """Sleeps so that recorded time passes `speed` times as fast as real time. It starts with its first call."""
+    """Sleeps so that recorded time passes `speed` times as fast as real time, from the first call on."""
 
     def __init__(
         self, speed: float, clock: Callable[[], int] = time.monotonic_ns, sleep: Callable[[float], None] = time.sleep
@@ -18,23 +19,23 @@ class Pacer:
         self._start_ns: int | None = None
 
     def __call__(self, since_start_ns: int) -> None:
-        """Sleep until so much of the drive should have passed."""
+        """Sleep until this time of the drive is due."""
         if self._start_ns is None:
             self._start_ns = self._clock()
         ahead_ns = self._start_ns + since_start_ns / self._speed - self._clock()
         if ahead_ns > 0:
-            self._sleep(ahead_ns / 1e9)
+            self._sleep(ahead_ns / SECOND)
 
     @property
     def elapsed_ns(self) -> int:
-        """How much of the drive should have passed by now."""
+        """The time of the drive that is due now."""
         return 0 if self._start_ns is None else round((self._clock() - self._start_ns) * self._speed)
 
 
 class ReplayClock(HostClock):
-    """The time line of a drive that is replayed: how far it should have come by its pacer, or else how far it has come.
+    """The time of a replayed drive: the time that is due by its pacer, or without one the time reached.
 
-    `first_ns` and `now_ns` tell the receipts of the first and of the latest event.
+    `first_ns` and `now_ns` return the receipts of the first and of the latest event.
     """
 
     def __init__(self, first_ns: Callable[[], int], now_ns: Callable[[], int], pacer: Pacer | None) -> None:
@@ -46,5 +47,5 @@ class ReplayClock(HostClock):
         return self._reached_ns() if self._pacer is None else self._first_ns() + self._pacer.elapsed_ns
 
     def from_wall_ns(self, wall_ns: int) -> int:
-        """The present instant: stamps of the wall clock mean nothing here."""
+        """The present instant: stamps of the wall clock have no meaning here."""
         return self.now_ns()

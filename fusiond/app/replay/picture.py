@@ -15,19 +15,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from fusiond.app.replay.comparison import wrapped
 from fusiond.app.replay.summary import Summary
 from fusiond.app.replay.trace import FixSample, TickSample, Trace
+from fusiond.app.replay.truth import wrapped
+from fusiond.units import SECOND, nanoseconds
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's colours, told apart by colour-blind eyes as well
+# Okabe and Ito's colours, which colour-blind readers can distinguish too
 BLUE, VERMILION, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#808080"
 STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.titlesize": 10}
 SIZE, DPI = (13.0, 6.8), 110  # inches, dots per inch
-LARGEST_AXIS_SIGMAS = 4.0  # how far an error axis reaches, in median sigmas, at the least
+MIN_AXIS_SIGMAS = 4.0  # an error axis extends at least to this many median sigmas
 CLOSE_UP_M = 25.0  # half the width of the close-up
-MOST_MARKS = 400  # rejected fixes marked one by one on the error axes
+MAX_MARKS = 400  # rejected fixes marked one by one on the error axes
 
 
 def draw(trace: Trace, summary: Summary, path: Path) -> None:
@@ -36,16 +37,16 @@ def draw(trace: Trace, summary: Summary, path: Path) -> None:
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.3))
-        ticks, taken, rejected = trace.ticks.items, trace.fixes.items, trace.rejected.items
+        ticks, fixes, rejected = trace.ticks.items, trace.fixes.items, trace.rejected.items
         left, right = grid[0].subgridspec(2, 1), grid[1].subgridspec(3, 1)
         over, close = figure.add_subplot(left[0]), figure.add_subplot(left[1])
         for axes in (over, close):
-            _track(axes, ticks, taken, rejected)
+            _track(axes, ticks, fixes, rejected)
         over.set(title="Track", aspect="equal", adjustable="datalim")
         _close_up(close, ticks, summary)
         figure.legend(*over.get_legend_handles_labels(), loc="outside lower left", ncols=5, frameon=False)
         top = figure.add_subplot(right[0])
-        others = (figure.add_subplot(right[row], sharex=top) for row in (1, 2))
+        others = (figure.add_subplot(right[place], sharex=top) for place in (1, 2))
         _errors([top, *others], ticks, rejected, summary)
         figure.suptitle(_title(summary), fontsize=11, x=0.01, ha="left", fontweight="bold")
         figure.savefig(path, format="png", metadata={"Software": "fusiond"})
@@ -67,7 +68,7 @@ def _track(axes: Axes, ticks: Sequence[TickSample], fixes: Sequence[FixSample], 
     if any(tick.errors for tick in ticks):
         true = np.array([(tick.true_east_m, tick.true_north_m) for tick in ticks])
         axes.plot(true[:, 0], true[:, 1], color="black", linewidth=4.5, alpha=0.25, label="truth", zorder=1)
-    axes.plot(*_places(fixes), ".", color=ORANGE, markersize=4, label="GNSS fixes taken", zorder=2)
+    axes.plot(*_places(fixes), ".", color=ORANGE, markersize=4, label="GNSS fixes", zorder=2)
     if rejected:
         axes.plot(*_places(rejected), "x", color=VERMILION, markersize=5, label="rejected", zorder=4)
     axes.plot(east, north, color=BLUE, linewidth=1.4, label="fused", zorder=3)
@@ -82,13 +83,13 @@ def _track(axes: Axes, ticks: Sequence[TickSample], fixes: Sequence[FixSample], 
 
 
 def _close_up(axes: Axes, ticks: Sequence[TickSample], summary: Summary) -> None:
-    """Limit axes to where the longest dead reckoning ended, or else to the end of the track."""
+    """Limit the axes to the end of the longest dead reckoning, or of the track if there was none."""
     stretches = summary.dead_reckoning.stretches if summary.dead_reckoning else []
     longest = max(stretches, key=lambda stretch: stretch.stop_s - stretch.start_s, default=None)
     axes.set(title="Close-up: the end of the longest dead reckoning" if longest else "Close-up: the end", aspect="equal")
     if not ticks:
         return
-    stop_ns = summary.span.first_ns + round(longest.stop_s * 1e9) if longest else ticks[-1].t_ns
+    stop_ns = summary.span.first_ns + nanoseconds(longest.stop_s) if longest else ticks[-1].t_ns
     centre = min(ticks, key=lambda tick: abs(tick.t_ns - stop_ns))
     axes.set_box_aspect(0.5)
     axes.set_xlim(centre.east_m - CLOSE_UP_M, centre.east_m + CLOSE_UP_M)
@@ -100,18 +101,18 @@ def _places(fixes: Sequence[FixSample]) -> tuple[list[float], list[float]]:
 
 
 def _errors(axes: Sequence[Axes], ticks: Sequence[TickSample], rejected: Sequence[FixSample], summary: Summary) -> None:
-    """Errors inside their band of two sigma; without a truth, the band alone."""
+    """Errors and their band of two sigma; without a truth only the band."""
     first_ns = summary.span.first_ns
-    second = np.array([(tick.t_ns - first_ns) / 1e9 for tick in ticks])
+    second = np.array([(tick.t_ns - first_ns) / SECOND for tick in ticks])
     offset = summary.truth.heading.offset_deg if summary.truth else 0.0
-    rows = [tick.errors for tick in ticks]
+    errors = [tick.errors for tick in ticks]
     none = float("nan")
     curves: list[tuple[str, list[float], list[float]]] = [
-        ("north error [m]", [e.north_m if e else none for e in rows], [tick.sigma_north_m for tick in ticks]),
-        ("east error [m]", [e.east_m if e else none for e in rows], [tick.sigma_east_m for tick in ticks]),
+        ("north error [m]", [e.north_m if e else none for e in errors], [tick.sigma_north_m for tick in ticks]),
+        ("east error [m]", [e.east_m if e else none for e in errors], [tick.sigma_east_m for tick in ticks]),
         (
             "heading error [deg]",
-            [wrapped(e.yaw_deg - offset) if e else none for e in rows],
+            [wrapped(e.yaw_deg - offset) if e else none for e in errors],
             [tick.sigma_yaw_deg for tick in ticks],
         ),
     ]
@@ -120,8 +121,8 @@ def _errors(axes: Sequence[Axes], ticks: Sequence[TickSample], rejected: Sequenc
         ax.set_ylabel(label)
         for stretch in summary.dead_reckoning.stretches if summary.dead_reckoning else ():
             ax.axvspan(stretch.start_s, stretch.stop_s, color=GREEN, alpha=0.15, linewidth=0)
-        for fix in rejected[:MOST_MARKS]:
-            ax.axvline((fix.t_ns - first_ns) / 1e9, color=VERMILION, alpha=0.25, linewidth=1.0)
+        for fix in rejected[:MAX_MARKS]:
+            ax.axvline((fix.t_ns - first_ns) / SECOND, color=VERMILION, alpha=0.25, linewidth=1.0)
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
     axes[-1].set_xlabel("time from the first event [s]")
@@ -137,12 +138,12 @@ def _band(ax: Axes, second: Array, values: Array, sigmas: Array) -> None:
     ax.axhline(0.0, color=GREY, linewidth=0.6)
     ax.grid(alpha=0.25)
     if len(sigmas):
-        # the first moments, when little is known yet, must not flatten all the rest
-        typical = max(float(np.quantile(2 * sigmas, 0.98)), LARGEST_AXIS_SIGMAS * float(np.median(sigmas)))
-        seen = np.abs(values[np.isfinite(values)])
-        reach = 1.15 * max(typical, float(np.quantile(seen, 0.99)) if len(seen) else 0.0)
-        if reach > 0:
-            ax.set_ylim(-reach, reach)
+        # the large values at the start must not flatten the rest
+        typical = max(float(np.quantile(2 * sigmas, 0.98)), MIN_AXIS_SIGMAS * float(np.median(sigmas)))
+        known = np.abs(values[np.isfinite(values)])
+        limit = 1.15 * max(typical, float(np.quantile(known, 0.99)) if len(known) else 0.0)
+        if limit > 0:
+            ax.set_ylim(-limit, limit)
 
 
 def _keys(compared: bool, rejected: bool, summary: Summary) -> list[Patch | Line2D]:

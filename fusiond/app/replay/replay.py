@@ -1,6 +1,6 @@
-"""Replay: recorded events through the engine in their order of receipt, and what is made of its messages.
+"""Replay: recorded events go through the engine in their order of receipt; its messages to files, statistics, outputs.
 
-A tick is a publication, see `fusiond.engine`: it tells what the live daemon told at that instant.
+A tick is a publication, see `fusiond.engine`: it has the messages that the live daemon published at that instant.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from fusiond import __version__
-from fusiond.app.replay.comparison import Comparison, Errors, Truth, Window, errors_of
+from fusiond.app.replay.comparison import Comparison, Errors, Window, errors_of
 from fusiond.app.replay.intervals import Withheld
 from fusiond.app.replay.summary import (
     DeadReckoningLog,
@@ -21,14 +21,16 @@ from fusiond.app.replay.summary import (
     Summary,
     source_report,
 )
+from fusiond.app.replay.truth import Truth
 from fusiond.config.schema import Config
-from fusiond.engine import SECOND, Engine
+from fusiond.engine import Engine
 from fusiond.estimator.fusion import Receipt
 from fusiond.events import ClockPair, Received
 from fusiond.filter.rows import Outcome
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages import Message, StateMessage
-from fusiond.messages.schedule import Surroundings
+from fusiond.messages.schedule import IoHealth
+from fusiond.units import SECOND
 
 WHOLE = Window()
 
@@ -39,54 +41,54 @@ Pace = Callable[[int], None]
 
 
 @dataclass
-class Wants:
-    """What a replay is to do besides fusing. Without a tick sink there are no ticks."""
+class ReplayTask:
+    """What a replay does besides fusing. Without a sink for ticks or messages there are no ticks."""
 
     rate_hz: float
     withheld: Sequence[Withheld] = ()
     truth: Truth | None = None
-    pace: Pace | None = None  # called with the time of what comes next [ns from the first event]; may sleep
+    pace: Pace | None = None  # called with the time of the next event or tick [ns from the first event]; may sleep
     on_tick: list[TickSink] = field(default_factory=list)
     on_receipt: list[ReceiptSink] = field(default_factory=list)
     on_message: list[MessageSink] = field(default_factory=list)  # everything that a live run would publish
     window: Window = WHOLE  # of the comparison with the truth
-    stored: StoredState | None = None  # that the run began with
-    surroundings: Callable[[], Surroundings] = Surroundings  # what the health says of attached outputs
+    stored_state: StoredState | None = None  # that the run started with
+    io_health: Callable[[], IoHealth] = IoHealth  # health of the attached outputs
 
 
 class Replay:
     """One run of recorded events through an engine."""
 
-    def __init__(self, config: Config, wants: Wants) -> None:
+    def __init__(self, config: Config, task: ReplayTask) -> None:
         self.config = config
         self.events = self.clock_pairs = 0
-        self._wants = wants
-        self._ticking = bool(wants.on_tick or wants.on_message) or wants.truth is not None
+        self._task = task
+        self._ticking = bool(task.on_tick or task.on_message) or task.truth is not None
         self.engine = Engine(
             config,
-            self._take_message if self._ticking else None,
-            rate_hz=wants.rate_hz,
-            only_states=not wants.on_message,
-            surroundings=wants.surroundings,
-            pace=wants.pace,
-            stored=wants.stored,
+            self._receive if self._ticking else None,
+            rate_hz=task.rate_hz,
+            only_states=not task.on_message,
+            io_health=task.io_health,
+            pace=task.pace,
+            stored_state=task.stored_state,
         )
         self.fusion = self.engine.fusion
         self._withheld: Counter[str] = Counter()
         self._modes: Counter[str] = Counter()
         self._latencies = {source: Latencies() for source in config.sources()}
-        self._comparison = Comparison(wants.window)
+        self._comparison = Comparison(task.window)
         self._reckoning = DeadReckoningLog(config.filter.position_timeout_s)
 
     def run(self, events: Iterable[Received]) -> None:
-        """Take all events, in order of receipt."""
+        """Feed all events, in order of receipt."""
         for event in events:
             self.events += 1
-            if self._wants.withheld and self._is_withheld(event):
+            if self._task.withheld and self._is_withheld(event):
                 self._withheld[event.source] += 1
                 self.engine.advance(event.t_receive_ns)
             else:
-                self._note(event, self.engine.feed(event))
+                self._count(event, self.engine.feed(event))
         self.engine.finish()
 
     @property
@@ -96,51 +98,51 @@ class Replay:
 
     @property
     def elapsed_ns(self) -> int:
-        """How much of the drive has passed."""
+        """Time from the first receipt to the latest."""
         return self.engine.elapsed_ns
 
     def _is_withheld(self, event: Received) -> bool:
         first_ns = event.t_receive_ns if self.first_ns is None else self.first_ns
         since_ns = max(event.t_receive_ns, self.engine.now_ns) - first_ns
         return any(
-            event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._wants.withheld
+            event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._task.withheld
         )
 
-    def _note(self, event: Received, receipt: Receipt | None) -> None:
+    def _count(self, event: Received, receipt: Receipt | None) -> None:
         if receipt is None:
             self.clock_pairs += isinstance(event.payload, ClockPair)
             return
         if receipt.refusal is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)
-        for sink in self._wants.on_receipt:
+        for sink in self._task.on_receipt:
             sink(receipt)
 
-    def _take_message(self, message: Message) -> None:
+    def _receive(self, message: Message) -> None:
         if isinstance(message, StateMessage):
-            self._take_state(message)
-        for sink in self._wants.on_message:
+            self._add_state(message)
+        for sink in self._task.on_message:
             sink(message)
 
-    def _take_state(self, state: StateMessage) -> None:
+    def _add_state(self, state: StateMessage) -> None:
         assert self.first_ns is not None
         since_start_ns = state.t_ns - self.first_ns
-        errors = errors_of(state, self._wants.truth.at(state.t_ns)) if self._wants.truth else None
+        errors = errors_of(state, self._task.truth.at(state.t_ns)) if self._task.truth else None
         self._modes[state.mode.value] += 1
         self._reckoning.add(since_start_ns, state, errors)
         if errors:
             self._comparison.add(since_start_ns, errors)
-        for sink in self._wants.on_tick:
+        for sink in self._task.on_tick:
             sink(state, errors)
 
     def summary(self, config_name: str, logs: dict[str, dict[str, int]], warnings: list[str]) -> Summary:
-        """What came out. There must have been an event."""
+        """The summary. There must have been an event."""
         engine = self.engine
         assert engine.first_ns is not None
         published = None
         if self._ticking:
             modes = dict(self._modes)
-            published = Publications(rate_hz=self._wants.rate_hz, rows=engine.ticks, skipped=engine.skipped, modes=modes)
+            published = Publications(rate_hz=self._task.rate_hz, rows=engine.ticks, skipped=engine.skipped, modes=modes)
         return Summary(
             fusiond=__version__,
             config=config_name,

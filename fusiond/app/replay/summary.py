@@ -1,4 +1,4 @@
-"""The summary of a replay: what arrived, how late, what became of it, how good the result is; as struct and as text."""
+"""The summary of a replay: events, latencies, outcomes and errors, as a struct and as text."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from datetime import UTC, datetime
 import msgspec
 from msgspec import Struct
 
-from fusiond.app.replay.comparison import Errors, Histogram, TruthReport
+from fusiond.app.replay.comparison import Errors, TruthReport
+from fusiond.app.replay.statistics import Histogram
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
 from fusiond.timeline.aligner import ClockReport
+from fusiond.units import MILLISECOND, SECOND
 
-LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # bins of the latency histograms and where they end
-LATENCIES_AT_ONCE = 1024
-LISTED_STRETCHES = 50  # stretches of dead reckoning that are told one by one
+LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # width and limit of the histogram's bins
+BATCH = 1024  # latencies added to the histogram together
+MAX_STRETCHES = 50  # stretches of dead reckoning that are listed
 
 
 class Latency(Struct, frozen=True, kw_only=True):
-    """Receipt less the instant measured [ms], configured delays included. Quantiles are right to 0.05 ms."""
+    """Receipt less the instant measured [ms], configured delays included. Quantiles are accurate to 0.05 ms."""
 
     min: float
     p50: float
@@ -31,8 +33,7 @@ class Latency(Struct, frozen=True, kw_only=True):
 
 
 class SourceReport(Struct, frozen=True, kw_only=True):
-    """What became of the events of one source, by the last word on each. The outcomes and `withheld` add up to
-    `events`."""
+    """Counts of the events of one source by their last outcome. The outcomes and `withheld` add up to `events`."""
 
     events: int
     fused: int
@@ -43,11 +44,11 @@ class SourceReport(Struct, frozen=True, kw_only=True):
     waiting: int
     withheld: int
     invalid_reasons: dict[str, int]
-    latency_ms: Latency | None  # None where no event was usable
+    latency_ms: Latency | None  # None if no event was usable
 
 
 class Span(Struct, frozen=True, kw_only=True):
-    """From the first event's receipt to the last one's."""
+    """From the receipt of the first event to that of the last."""
 
     first_ns: int
     last_ns: int
@@ -55,12 +56,12 @@ class Span(Struct, frozen=True, kw_only=True):
 
 
 class Publications(Struct, frozen=True, kw_only=True):
-    """The ticks of a replay. In a hole of the recording ticks stop after a minute; those left out are counted."""
+    """The ticks of a replay. In a gap of the recording they stop after a minute; those skipped are counted."""
 
     rate_hz: float
-    rows: int
+    rows: int  # states
     skipped: int
-    modes: dict[str, int]  # rows by mode
+    modes: dict[str, int]  # states by mode
 
 
 class Stretch(Struct, frozen=True, kw_only=True):
@@ -74,7 +75,7 @@ class Stretch(Struct, frozen=True, kw_only=True):
 
 
 class DeadReckoning(Struct, frozen=True, kw_only=True):
-    """All the stretches; `stretches` are the first of them."""
+    """Number and total time of all stretches, and the first of them."""
 
     count: int
     seconds: float
@@ -82,17 +83,17 @@ class DeadReckoning(Struct, frozen=True, kw_only=True):
 
 
 class Summary(Struct, frozen=True, kw_only=True):
-    """Everything a replay tells at its end. The same inputs give the same bytes: no clock and no path is in it."""
+    """The report of a replay. The same inputs give the same bytes: it has no wall-clock time and no path."""
 
     fusiond: str  # version
     config: str  # name of the file
     vehicle: str
-    logs: dict[str, dict[str, int]]  # what the readers met, by file name
+    logs: dict[str, dict[str, int]]  # counts of the readers, by file name
     warnings: list[str]
     span: Span
     events: int
-    clock_pairs: int  # events that only teach the clock
-    rerun: int  # events run again because another came late
+    clock_pairs: int  # events that are only for the clock
+    rerun: int  # events run again because another was late
     sources: dict[str, SourceReport]
     clocks: dict[str, ClockReport]
     final: StateMessage
@@ -106,7 +107,7 @@ def to_json(summary: Summary) -> bytes:
     return msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"
 
 
-# --- Gathering
+# --- Collecting
 
 
 class Latencies:
@@ -119,29 +120,29 @@ class Latencies:
     def add(self, latency_ns: int) -> None:
         new = self._new
         new.append(latency_ns)
-        if len(new) == LATENCIES_AT_ONCE:
-            self._gather()
+        if len(new) == BATCH:
+            self._add_batch()
 
-    def _gather(self) -> None:
-        """Alike ones, as all of a stream without stamps are, go into the histogram together."""
+    def _add_batch(self) -> None:
+        """Equal latencies, such as all of a source without stamps, are added to the histogram together."""
         for latency_ns, count in Counter(self._new).items():
-            self._histogram.add(latency_ns / 1e6, count)
+            self._histogram.add(latency_ns / MILLISECOND, count)
         self._new.clear()
 
     def report(self) -> Latency | None:
-        self._gather()
+        self._add_batch()
         histogram = self._histogram
         if not histogram.count:
             return None
         p50, p90, p99 = (round(histogram.quantile(share), 2) for share in (0.5, 0.9, 0.99))
-        return Latency(min=histogram.least, p50=p50, p90=p90, p99=p99, max=histogram.greatest)
+        return Latency(min=histogram.minimum, p50=p50, p90=p90, p99=p99, max=histogram.maximum)
 
 
 class DeadReckoningLog:
-    """Watches the publications for stretches of dead reckoning."""
+    """Collects the stretches of dead reckoning from the publications."""
 
     def __init__(self, timeout_s: float) -> None:
-        self._timeout_s = timeout_s  # the mode changes so long after the last fix
+        self._timeout_s = timeout_s  # the mode changes this long after the last fix
         self._stretches: list[Stretch] = []
         self._count = 0
         self._seconds = 0.0
@@ -150,8 +151,8 @@ class DeadReckoningLog:
         self._last: tuple[float, float, float, float | None] | None = None  # second, distance, sigma, error
 
     def add(self, since_start_ns: int, message: StateMessage, errors: Errors | None) -> None:
-        """Take one publication; they must come in order of time."""
-        state, second = message.state, since_start_ns / 1e9
+        """Add one publication; they must come in order of time."""
+        state, second = message.state, since_start_ns / SECOND
         reckoned = message.mode is Mode.DEAD_RECKONING and state is not None
         if self._begun is not None and not reckoned:
             self._close(second)
@@ -175,13 +176,13 @@ class DeadReckoningLog:
         _, stop_m, sigma, error = self._last
         self._count += 1
         self._seconds += stop_s - start_s
-        if len(self._stretches) < LISTED_STRETCHES:
+        if len(self._stretches) < MAX_STRETCHES:
             stretch = Stretch(start_s=start_s, stop_s=stop_s, distance_m=stop_m - start_m, sigma_m=sigma, error_m=error)
             self._stretches.append(stretch)
         self._begun = self._last = None
 
     def report(self) -> DeadReckoning:
-        """The stretches; one that is still open ends with the last publication."""
+        """The stretches. One that has not ended yet ends with the last publication."""
         if self._last is not None:
             self._close(self._last[0])
         return DeadReckoning(count=self._count, seconds=self._seconds, stretches=list(self._stretches))
@@ -201,7 +202,7 @@ def source_report(
     )
 
 
-# --- Telling
+# --- Text
 
 
 def text(summary: Summary) -> str:
@@ -211,7 +212,7 @@ def text(summary: Summary) -> str:
 
 def _lines(summary: Summary) -> Iterator[str]:
     span = summary.span
-    first = datetime.fromtimestamp(span.first_ns // 10**9, UTC)
+    first = datetime.fromtimestamp(span.first_ns // SECOND, UTC)
     logs = ", ".join(summary.logs)
     yield f"{summary.vehicle}: {span.seconds:.1f} s from {first:%Y-%m-%d %H:%M:%S} UTC out of {logs}"
     for warning in summary.warnings:
@@ -231,21 +232,21 @@ def _lines(summary: Summary) -> Iterator[str]:
 
 
 def _source_table(sources: Mapping[str, SourceReport]) -> Iterator[str]:
-    """One line per source; columns of nothing but zeros are left out, except the first three."""
+    """One line per source; columns of zeros are left out, except the first three."""
     names = ["events", "fused", "rejected", "too_old", "duplicate", "invalid", "waiting", "withheld"]
     shown = [n for n in names if n in names[:3] or any(getattr(source, n) for source in sources.values())]
-    rows = [["source", *(name.replace("_", " ") for name in shown), "late by [ms]: median", "99 %", "most"]]
+    lines = [["source", *(name.replace("_", " ") for name in shown), "late by [ms]: median", "99 %", "max"]]
     for name, source in sources.items():
         late = source.latency_ms
         times = [f"{late.p50:.1f}", f"{late.p99:.1f}", f"{late.max:.1f}"] if late else ["-"] * 3
-        rows.append([name, *(str(getattr(source, column)) for column in shown), *times])
-    yield from table(rows)
+        lines.append([name, *(str(getattr(source, column)) for column in shown), *times])
+    yield from table(lines)
 
 
-def table(rows: list[list[str]]) -> Iterator[str]:
-    """Rows as aligned lines: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for first, *others in rows:
+def table(lines: list[list[str]]) -> Iterator[str]:
+    """Cells as aligned lines: the first column aligned left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for first, *others in lines:
         cells = [first.ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(others, widths[1:], strict=True))]
         yield "  ".join(cells).rstrip()
 
@@ -256,9 +257,9 @@ def _remarks(summary: Summary) -> Iterator[str]:
             reasons = ", ".join(f"{reason} ({count})" for reason, count in source.invalid_reasons.items())
             yield f"  invalid of {name}: {reasons}"
         if source.too_old:
-            yield f"  {name}: {source.too_old} came later than filter.horizon_s allows; a longer one would take them"
+            yield f"  {name}: {source.too_old} came later than filter.horizon_s allows; a longer horizon would use them"
     if summary.rerun:
-        yield f"  late events were put where they belong in time: {summary.rerun} events were run again after them"
+        yield f"  late events were fused at their own time: {summary.rerun} events were run again after them"
     for name, clock in summary.clocks.items():
         if clock.note:
             yield f"  clock {name}: {clock.method.replace('_', ' ')}, because {clock.note}"
@@ -284,16 +285,16 @@ def _state(summary: Summary) -> Iterator[str]:
 
 def _published(published: Publications) -> Iterator[str]:
     modes = ", ".join(f"{count} {mode.replace('_', ' ')}" for mode, count in published.modes.items())
-    skipped = f"; {published.skipped} left out in holes of the recording" if published.skipped else ""
+    skipped = f"; {published.skipped} skipped in gaps of the recording" if published.skipped else ""
     yield f"published      {published.rows} states at {published.rate_hz:g} Hz: {modes or 'none'}{skipped}"
 
 
 def _dead_reckoning(found: DeadReckoning) -> Iterator[str]:
     for stretch in found.stretches[:5]:
-        off = "" if stretch.error_m is None else f", {stretch.error_m:.2f} m off the truth"
+        error = "" if stretch.error_m is None else f", error {stretch.error_m:.2f} m"
         yield (
             f"dead reckoning from {stretch.start_s:.1f} to {stretch.stop_s:.1f} s, over {stretch.distance_m:.0f} m:"
-            f" ended with a sigma of {stretch.sigma_m:.2f} m{off}"
+            f" at the end sigma {stretch.sigma_m:.2f} m{error}"
         )
     if found.count > 5:
         yield f"               and {found.count - 5} more times; {found.seconds:.0f} s in all"
@@ -303,7 +304,7 @@ def _truth(truth: TruthReport) -> Iterator[str]:
     position, heading = truth.position, truth.heading
     offset = math.hypot(position.offset_north_m, position.offset_east_m)
     yield (
-        f"against the truth, seconds {truth.start_s:.1f} to {truth.stop_s:.1f}:"
+        f"compared with the truth, seconds {truth.start_s:.1f} to {truth.stop_s:.1f}:"
         f" {truth.rows} states over {truth.distance_m:.0f} m"
     )
     yield from table(
@@ -323,5 +324,5 @@ def _truth(truth: TruthReport) -> Iterator[str]:
         ]
     )
     share = position.end_m / truth.distance_m if truth.distance_m else 0.0
-    yield f"  {position.end_m:.2f} m off at the end, {100 * share:.2f} % of the way; {position.max_m:.2f} m at most"
-    yield f"  {100 * position.inside_95:.1f} % of the states lie inside their own 95 % ellipse (95 or more is honest)"
+    yield f"  error at the end {position.end_m:.2f} m, {100 * share:.2f} % of the distance; max {position.max_m:.2f} m"
+    yield f"  {100 * position.inside_95:.1f} % of the states have the truth inside their 95 % ellipse (should be 95 or more)"

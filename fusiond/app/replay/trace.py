@@ -1,25 +1,27 @@
-"""What a picture of a replay needs: samples of the published states and the GNSS fixes, thinned to a bounded number."""
+"""The data for a picture of a replay: samples of the published states and the GNSS fixes, thinned to a bounded number."""
 
 from __future__ import annotations
 
 import math
 from typing import Generic, NamedTuple, TypeVar
 
-from fusiond.app.replay.comparison import Errors, displacement
+from fusiond.app.replay.comparison import Errors
+from fusiond.app.replay.truth import displacement
 from fusiond.estimator.fusion import Receipt
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssPosition
 from fusiond.filter.rows import Outcome
 from fusiond.messages.types import StateMessage
+from fusiond.units import MILLISECOND
 
 CAPACITY = 6000  # samples kept of each kind: more than a picture has pixels across
-UNREAD_NS = 250_000_000  # a fix is looked up in the history so long after its receipt at the latest
+MAX_UNREAD_NS = 250 * MILLISECOND  # a fix is looked up in the history at most this long after its receipt
 
 Item = TypeVar("Item")
 
 
 class Thinned(Generic[Item]):
-    """A list that keeps every n-th item, n doubling whenever it is full."""
+    """A list that keeps every n-th item; n doubles whenever it is full."""
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         self.items: list[Item] = []
@@ -36,7 +38,7 @@ class Thinned(Generic[Item]):
 
 
 class TickSample(NamedTuple):
-    """One publication; places are in metres north and east of the trace's origin, the first place of all."""
+    """One publication; positions are in metres north and east of the trace's origin, the first position of all."""
 
     t_ns: int
     north_m: float
@@ -47,26 +49,26 @@ class TickSample(NamedTuple):
     sigma_yaw_deg: float
     reckoned: bool  # dead reckoning
     errors: Errors | None
-    true_north_m: float  # not a number without errors
+    true_north_m: float  # nan without errors
     true_east_m: float
 
 
 class FixSample(NamedTuple):
     """One GNSS position as received."""
 
-    t_ns: int  # aligned: the instant it tells of
+    t_ns: int  # instant of the measurement, aligned
     north_m: float
     east_m: float
 
 
 class Trace:
-    """Gathers the samples of one replay."""
+    """Collects the samples of one replay."""
 
     def __init__(self) -> None:
         self.ticks: Thinned[TickSample] = Thinned()
         self.fixes: Thinned[FixSample] = Thinned()
-        self.rejected: Thinned[FixSample] = Thinned()  # apart, so that thinning loses none of a few
-        self._unread: list[tuple[Receipt, FixSample]] = []  # fixes whose outcome has not been asked for
+        self.rejected: Thinned[FixSample] = Thinned()  # separate, so that thinning does not lose the few
+        self._unread: list[tuple[Receipt, FixSample]] = []  # fixes whose outcome has not been read
         self._origin: tuple[float, float, float] | None = None  # lat, lon [deg], height [m]
 
     def add_tick(self, message: StateMessage, errors: Errors | None) -> None:
@@ -84,20 +86,20 @@ class Trace:
         self.ticks.add(TickSample(message.t_ns, north, east, state.yaw_deg, *sigmas, reckoned, errors, *true))
 
     def add_receipt(self, receipt: Receipt) -> None:
-        """The outcome is asked for later: at once, the history would have to run its rows again for each late fix."""
+        """The outcome is read later: reading it here would make the history run its rows again for each late fix."""
         measurement, fix = receipt.measurement, receipt.measurement.payload
-        if self._unread and measurement.t_receive_ns - self._unread[0][0].measurement.t_receive_ns > UNREAD_NS:
+        if self._unread and measurement.t_receive_ns - self._unread[0][0].measurement.t_receive_ns > MAX_UNREAD_NS:
             self.read_outcomes()
         if isinstance(fix, GnssPosition) and receipt.refusal is not Outcome.INVALID:
             north, east = self._place(math.degrees(fix.latitude), math.degrees(fix.longitude), fix.height)
             self._unread.append((receipt, FixSample(measurement.t_ns, north, east)))
 
     def read_outcomes(self) -> None:
-        """Ask for the outcomes of the fixes received lately; also to be called at the end."""
+        """Read the outcomes of the latest fixes; call it at the end, too."""
         for receipt, sample in self._unread:
             try:
                 rejected = receipt.outcome is Outcome.REJECTED
-            except LookupError:  # forgotten already: it came just inside the horizon
+            except LookupError:  # no longer in the history: it came just inside the horizon
                 rejected = False
             (self.rejected if rejected else self.fixes).add(sample)
         self._unread.clear()

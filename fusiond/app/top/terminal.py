@@ -1,4 +1,4 @@
-"""`fusiond top`: a vehicle's state and health live in a terminal, read over Zenoh."""
+"""`fusiond top`: a vehicle's state and health in a terminal, read over Zenoh."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMe
 from fusiond.ports.outputs import Outbox
 
 SHOWN: tuple[type[Message], ...] = (StateMessage, HealthMessage, EventMessage)
-MOST_WAITING = 1024
+MAX_WAITING = 1024  # messages
 REDRAW_S = 0.25
-FIRST_S = 5.0  # how long `once` waits for a state and a health
+FIRST_S = 5.0  # how long `once` waits for a state and a health message
 CODES: dict[Colour, str] = {"plain": "0", "dim": "2", "bold": "1", "green": "32", "yellow": "33", "red": "1;31"}
-ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # a screen of its own, without a cursor; and back
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # the alternate screen without a cursor, and back
 HOME, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
 QUIT = frozenset("qQ\x03\x04")
 
@@ -34,20 +34,20 @@ class Watch:
     def __init__(self, client: Client, clock: Callable[[], float] = time.monotonic) -> None:
         self.view = View()
         self._client, self._clock = client, clock
-        self._outbox = Outbox(MOST_WAITING, SHOWN)
+        self._outbox = Outbox(MAX_WAITING, SHOWN)
         self._stack = ExitStack()
         self._last = clock()
 
-    def look(self, timeout_s: float) -> None:
-        """Take in what has come; waits for it up to `timeout_s`."""
+    def update(self, timeout_s: float) -> None:
+        """Add the messages received, after waiting for one up to `timeout_s`."""
         for message in self._outbox.take(timeout_s):
-            self.view.take(message)
+            self.view.add(message)
             if isinstance(message, StateMessage):
                 self._last = self._clock()
 
     @property
     def silent_s(self) -> float:
-        """How long no state has come."""
+        """Time since the last state."""
         return self._clock() - self._last
 
     def __enter__(self) -> Watch:
@@ -62,20 +62,20 @@ class Watch:
 
 
 def choose(client: Client) -> str:
-    """The one vehicle there is. Raises ClientError where there is none, or several."""
+    """The only vehicle. Raises ClientError if there is none, or several."""
     found = sorted(client.alive())
     if len(found) == 1:
         return found[0]
     if not found:
         raise ClientError("no fusiond is running there")
-    raise ClientError(f"several vehicles are there; choose one by --vehicle: {', '.join(found)}")
+    raise ClientError(f"several vehicles are running; choose one by --vehicle: {', '.join(found)}")
 
 
 def once(watch: Watch, out: TextIO) -> None:
-    """Print one screen without colours. Raises ClientError where no state comes."""
+    """Print one screen without colours. Raises ClientError if no state comes."""
     until = time.monotonic() + FIRST_S
     while (watch.view.state is None or watch.view.health is None) and time.monotonic() < until:
-        watch.look(REDRAW_S)
+        watch.update(REDRAW_S)
     if watch.view.state is None:
         raise ClientError(f"no state for {FIRST_S:g} s")
     width, height = shutil.get_terminal_size((200, 100))
@@ -91,7 +91,7 @@ def live(watch: Watch, keys: TextIO, out: TextIO) -> None:
             lines = screen(watch.view, watch.silent_s, width, height - 1)
             out.write(HOME + "".join(ansi(line) + REST_OF_LINE + "\n" for line in lines) + REST_OF_SCREEN)
             out.flush()
-            watch.look(0)
+            watch.update(0)
             select.select([keys], [], [], REDRAW_S)
 
 
@@ -107,7 +107,7 @@ def _pressed(keys: TextIO) -> set[str]:
 
 @contextmanager
 def _raw(keys: TextIO) -> Iterator[None]:
-    """Keys one by one and unechoed; Ctrl-C stays what it is."""
+    """Read single keys without echo; Ctrl-C works as usual."""
     before = termios.tcgetattr(keys)
     tty.setcbreak(keys)
     try:
@@ -127,7 +127,7 @@ def _screen(out: TextIO) -> Iterator[None]:
 
 
 def run(endpoint: str, vehicle: str | None, config_file: str | None, *, just_once: bool) -> None:
-    """The command. Raises ClientError."""
+    """Run `fusiond top`. Raises ClientError."""
     if vehicle is None:
         with Client(endpoint, "*", config_file=config_file) as client:
             vehicle = choose(client)

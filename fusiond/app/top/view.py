@@ -1,4 +1,4 @@
-"""What `fusiond top` shows: the latest messages of one vehicle as lines of coloured text, for a terminal or a picture."""
+"""The screen of `fusiond top`: the latest messages of one vehicle as lines of coloured text, for a terminal or a picture."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from fusiond.messages.types import (
     State,
     StateMessage,
 )
+from fusiond.units import MILLISECOND, SECOND
 
-SECOND = 1_000_000_000  # ns
-SILENT_S = 2.0  # without a state for so long it is told
-EVENTS = 12  # remembered
+SILENT_S = 2.0  # a longer time without a state is shown
+EVENTS = 12  # shown
 STATES = 100  # over which the rate of the states is measured
 
 Colour = Literal["plain", "dim", "bold", "green", "yellow", "red"]
@@ -32,7 +32,7 @@ MODES: dict[Mode, Colour] = {
     Mode.ALIGNING: "yellow", Mode.NOMINAL: "green", Mode.DEAD_RECKONING: "yellow", Mode.LOST: "red",
 }  # fmt: skip
 SEVERITIES: dict[Severity, Colour] = {"info": "plain", "notice": "plain", "warning": "yellow", "critical": "red"}
-OUTCOMES = {  # by field: the column's head
+OUTCOMES = {  # column headings by field
     "fused": "fused", "rejected": "rejected", "too_old": "too old", "duplicate": "dupl", "invalid": "invalid",
     "waiting": "waiting",
 }  # fmt: skip
@@ -55,12 +55,12 @@ class View:
     def __init__(self) -> None:
         self.state: StateMessage | None = None
         self.health: HealthMessage | None = None
-        self.before: HealthMessage | None = None  # the health before it
+        self.before: HealthMessage | None = None  # the previous health
         self.events: deque[EventMessage] = deque(maxlen=EVENTS)
         self._stamps: deque[int] = deque(maxlen=STATES)
 
-    def take(self, message: Message) -> None:
-        """Take in a message of any kind."""
+    def add(self, message: Message) -> None:
+        """Add a message of any kind."""
         if isinstance(message, StateMessage):
             self.state = message
             self._stamps.append(message.t_ns)
@@ -71,14 +71,14 @@ class View:
 
     @property
     def rate_hz(self) -> float | None:
-        """States a second, by their stamps."""
+        """States per second, by their stamps."""
         stamps = self._stamps
         span_ns = stamps[-1] - stamps[0] if stamps else 0
         return (len(stamps) - 1) * SECOND / span_ns if span_ns > 0 else None
 
 
 def screen(view: View, silent_s: float, width: int, height: int) -> list[Line]:
-    """At most `height` lines of at most `width` columns; `silent_s` is how long no state has come."""
+    """At most `height` lines of at most `width` columns; `silent_s` is the time since the last state."""
     lines = list(_lines(view, silent_s))
     if len(lines) > height:
         lines = [*lines[: height - 1], (Span(f"... {len(lines) - height + 1} lines more", "dim"),)]
@@ -95,7 +95,7 @@ def _cut(line: Line, width: int) -> Iterator[Span]:
         if width <= 0:
             return
         text = "".join(character if character.isprintable() else "?" for character in span.text[:width])
-        yield Span(text, span.colour)  # whatever a message holds, it does not steer the terminal
+        yield Span(text, span.colour)  # no text of a message may control the terminal
         width -= len(span.text)
 
 
@@ -159,7 +159,7 @@ def _compass(degrees: float, letters: str) -> str:
 
 
 def _clock(t_ns: int) -> str:
-    return f"{datetime.fromtimestamp(t_ns // SECOND, UTC):%H:%M:%S}.{t_ns % SECOND // 100_000_000}"
+    return f"{datetime.fromtimestamp(t_ns // SECOND, UTC):%H:%M:%S}.{t_ns % SECOND // (100 * MILLISECOND)}"
 
 
 # --- The health
@@ -168,9 +168,9 @@ def _clock(t_ns: int) -> str:
 def _health(health: HealthMessage, before: HealthMessage | None) -> Iterator[Line]:
     latency = health.latency_ms
     stages = [("fused", latency.fused), ("published", latency.published)]
-    told = "  ".join(f"{name} {_quantiles(quantiles)}" for name, quantiles in stages if quantiles)
-    if told:
-        yield _pair("latency", f"{told} ms (p50 p99 max)")
+    text = "  ".join(f"{name} {_quantiles(quantiles)}" for name, quantiles in stages if quantiles)
+    if text:
+        yield _pair("latency", f"{text} ms (p50 p99 max)")
     yield _pair("up", f"{_duration(health.uptime_s)}  fusiond {health.version}")
     if health.reset_reason:
         yield _pair("reset", health.reset_reason)
@@ -192,26 +192,26 @@ def _health(health: HealthMessage, before: HealthMessage | None) -> Iterator[Lin
 
 
 def _source(name: str, source: SourceHealth, before: SourceHealth | None) -> Sequence[Span]:
-    there: Colour = "plain" if source.present else "red"
+    present: Colour = "plain" if source.present else "red"
     old = before.outcomes if before else source.outcomes
     ratio = source.test_ratio
     jitter = None if source.clock is None else source.clock.jitter_ms
-    odd = source.status not in (None, "nominal")
-    says = " ".join(filter(None, (source.status if odd else "", source.reason)))
+    degraded = source.status not in (None, "nominal")
+    text = " ".join(filter(None, (source.status if degraded else "", source.reason)))
     return (
-        Span(name, there),
-        Span(f"{source.rate_hz:.1f}", there),
-        Span(_number(source.age_ms, 0), there),
+        Span(name, present),
+        Span(f"{source.rate_hz:.1f}", present),
+        Span(_number(source.age_ms, 0), present),
         *(_outcome(outcome, source.outcomes, old) for outcome in OUTCOMES),
         Span(_number(ratio, 2), "yellow" if ratio is not None and ratio > 1 else "plain"),
         Span(_number(source.nis_mean, 2)),
         Span(_number(jitter, 2)),
-        Span("nothing comes" if not source.present else says, "red" if not source.present else "yellow"),
+        Span("nothing received" if not source.present else text, "red" if not source.present else "yellow"),
     )
 
 
 def _outcome(name: str, counts: OutcomeCounts, before: OutcomeCounts) -> Span:
-    """A count; yellow where one that should not grow has just done so."""
+    """A count; yellow if it is of a bad outcome and has grown."""
     count = getattr(counts, name)
     grows = name in BAD_OUTCOMES and count > getattr(before, name)
     return Span(str(count), "yellow" if grows else "plain" if count else "dim")
@@ -246,14 +246,14 @@ def _duration(seconds: float) -> str:
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[Span]]) -> Iterator[Line]:
-    """Columns as wide as need be: the first and the last to the left, numbers to the right."""
+    """Columns of minimum width: the first and the last aligned left, numbers right."""
     rows = list(rows)
     last = len(heads) - 1
     widths = [max(map(len, (head, *(row[i].text for row in rows)))) for i, head in enumerate(heads)]
 
-    def laid(i: int, text: str) -> str:
+    def aligned(i: int, text: str) -> str:
         return text.ljust(widths[i]) if i in (0, last) else text.rjust(widths[i])
 
-    yield tuple(Span(laid(i, head) + "  ", "bold") for i, head in enumerate(heads))
+    yield tuple(Span(aligned(i, head) + "  ", "bold") for i, head in enumerate(heads))
     for row in rows:
-        yield tuple(Span(laid(i, span.text) + "  ", span.colour) for i, span in enumerate(row))
+        yield tuple(Span(aligned(i, span.text) + "  ", span.colour) for i, span in enumerate(row))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fusiond.app.client import Client
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as config
 from fusiond.config.outputs import Zenoh
 from fusiond.config.schema import Config
@@ -243,7 +243,7 @@ def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[Config, Path, 
     """State, settled state, innovations and events are the same bytes; the health but for what the shell tells."""
     settings, box, live, _ = recorded
     again: list[Message] = []
-    Replay(settings, Wants(settings.publish.rate_hz, on_message=[again.append])).run(
+    Replay(settings, ReplayTask(settings.publish.rate_hz, on_message=[again.append])).run(
         open_logs([str(file) for file in sorted(box.iterdir())], settings)
     )
     for kind in (StateMessage, SettledMessage, InnovationMessage, EventMessage):

@@ -12,15 +12,15 @@ import pytest
 
 from fusiond.config import load as config
 from fusiond.config.toml import ConfigError
-from fusiond.ports.inputs import Receiver
-from fusiond.ports.outputs import Around
+from fusiond.ports.inputs import InputContext
+from fusiond.ports.outputs import OutputContext
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs.file import LogError
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.registry import INPUTS, LOG_FORMATS, OUTPUTS, make_inputs, make_outputs
 from tests.helpers.live import configuration
 
-RECEIVER = Receiver(HostClock(), lambda: None, lambda: True)
+CONTEXT = InputContext(HostClock(), lambda: None, lambda: True)
 
 
 @pytest.mark.parametrize("module", [*INPUTS.values(), *OUTPUTS])
@@ -41,15 +41,15 @@ def test_suffixes_are_unlike() -> None:
 
 
 def test_inputs_are_named_by_section(tmp_path: Path) -> None:
-    assert list(make_inputs(configuration(tmp_path, "udpin:127.0.0.1:14550"), RECEIVER)) == ["mavlink.fc", "can.car"]
+    assert list(make_inputs(configuration(tmp_path, "udpin:127.0.0.1:14550"), CONTEXT)) == ["mavlink.fc", "can.car"]
 
 
 def test_a_configuration_gets_the_outputs_that_it_asks_for(tmp_path: Path) -> None:
     plain = configuration(tmp_path, "udpin:127.0.0.1:14550")
-    assert list(make_outputs(plain, Around(RECEIVER.clock, make_inputs(plain, RECEIVER)))) == ["zenoh"]
+    assert list(make_outputs(plain, OutputContext(CONTEXT.clock, make_inputs(plain, CONTEXT)))) == ["zenoh"]
     more = '[autopilot]\nlink = "fc"\n[ground_station]\nconnection = "udpout:127.0.0.1:14551"\n'
     asked = configuration(tmp_path, "udpin:127.0.0.1:14550", more)
-    made = make_outputs(asked, Around(RECEIVER.clock, make_inputs(asked, RECEIVER)))
+    made = make_outputs(asked, OutputContext(CONTEXT.clock, make_inputs(asked, CONTEXT)))
     assert list(made) == ["zenoh", "autopilot", "ground_station"]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fusiond.__main__ import main
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.state_file import StateFile, read_state
 from fusiond.config import load as config
 from fusiond.config.schema import Config
@@ -24,6 +24,7 @@ from fusiond.filter.hot_start import Verdict
 from fusiond.filter.state import T
 from fusiond.filter.stored_state import StoredState, from_text, stored_state, to_text
 from fusiond.messages.codec import encode
+from fusiond.messages.types import StateMessage
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers import streams
 from tests.helpers.live import Autopilot, Running, configuration, drive, running
@@ -110,10 +111,14 @@ def test_killed_and_started_again(tmp_path: Path, bus: can.BusABC) -> None:
 
 
 def replayed(setup: Config, logs: list[Path], stored: StoredState | None) -> list[bytes]:
-    told: list[bytes] = []
-    wants = Wants(setup.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))], stored=stored)
-    Replay(setup, wants).run(open_logs([str(path) for path in logs], setup))
-    return told
+    published: list[bytes] = []
+
+    def keep(message: StateMessage, _: object) -> None:
+        published.append(encode(message, "json"))
+
+    task = ReplayTask(setup.publish.rate_hz, on_tick=[keep], stored_state=stored)
+    Replay(setup, task).run(open_logs([str(path) for path in logs], setup))
+    return published
 
 
 def test_a_torn_file_is_a_cold_start(tmp_path: Path, bus: can.BusABC, caplog: pytest.LogCaptureFixture) -> None:

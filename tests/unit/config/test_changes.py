@@ -40,3 +40,12 @@ def test_requested_rates_change_live(old: str, new: str, key: str) -> None:
 def test_other_keys_of_a_sensor_need_a_restart() -> None:
     new = TEXT.replace("rate_hz = 100.0", "rate_hz = 50.0\ndelay_ms = 3.0")
     assert changes(parse(TEXT), parse(new)) == ((), ("imu.imu0.delay_ms",))
+
+
+def test_a_connection_changes_live_and_anything_else_refuses_the_whole_reload() -> None:
+    assert changes(parse(TEXT), parse(TEXT)) == ((), ())
+    moved = TEXT.replace("[mavlink.fc]\n", '[mavlink.fc]\nconnection = "udpin:127.0.0.1:1"\n')
+    assert changes(parse(TEXT), parse(moved)) == (("mavlink.fc.connection",), ())
+    assert changes(parse(TEXT), parse(f"{moved}[filter]\nhorizon_s = 2.0\n")) == ((), ("filter.horizon_s",))
+    two = f'{TEXT}[wheel.right]\nlink = "fc"\nindex = 1\n'
+    assert changes(parse(two), parse(TEXT)) == ((), ("wheel.right",))

@@ -69,8 +69,8 @@ def test_hypotheses_that_are_not_finite_are_given_up(compiled: bool, whole: bool
             if not poisoned and head.stamps[PHASE] == CHOOSING and event.t_ns > T0 + SECOND:
                 poisoned = True
                 head.bank[:: 1 if whole else 4, -1] = math.nan  # the last variance of each, or of every fourth
-            fusion.take(event)
-            state = fusion.estimate_at(int(head.stamps[T])).state
+            fusion.fuse(event)
+            state = fusion.solution_at(int(head.stamps[T])).state
             assert state is None or math.isfinite(sum(state.velocity_n) + state.covariance.sum())
     assert poisoned
     assert head.stamps[BLOWN] == whole

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion
 from fusiond.maths.wgs84 import ecef, mat_ne
-from fusiond.messages.local_frame import ENU_FLU, GAP_NS, NED_FRD, Convention, LocalFrame, LocalState, OdometryFrame, Placed
+from fusiond.messages.local_frame import (
+    ENU_FLU,
+    MAX_GAP_NS,
+    NED_FRD,
+    Convention,
+    LocalFrame,
+    LocalState,
+    OdometryFrame,
+    Placed,
+)
 from tests.helpers.estimates import random_state
 
 ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -126,7 +135,7 @@ def test_over_a_pause_the_odometry_frame_rests() -> None:
     frame = OdometryFrame()
     for number in range(10):
         odom, _ = frame.follow(*driven(number, shift=5.0 if number >= 5 else 0.0))
-    resumed = 10 + GAP_NS // STEP_NS
+    resumed = 10 + MAX_GAP_NS // STEP_NS
     after, body = frame.follow(*driven(resumed, shift=5.0))
     assert after == odom
     assert_allclose(joined(after, body)[0], driven(resumed, shift=5.0)[1].position_l, atol=1e-9)

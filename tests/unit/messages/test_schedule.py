@@ -27,14 +27,14 @@ class Player:
         """A vehicle at rest, whose receiver is off to the north by so many metres at a second."""
         for number in range(round(seconds * 50)):
             second, wobble = begin_s + number / 50, 0.01 * (number % 7 - 3)
-            self._take("imu0", second, ImuSample((wobble, 0.0, -9.81), (1e-4, wobble / 10, 0.0)))
+            self._feed("imu0", second, ImuSample((wobble, 0.0, -9.81), (1e-4, wobble / 10, 0.0)))
             if number % 10 == 0:
                 latitude = math.radians(48.0) + metres_off(second) / 6.4e6
-                self._take("gps0.position", second + 1e-3, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
-                self._take("gps0.velocity", second + 1e-3, GnssVelocity(0.0, 0.0, 0.0, 0.1))
+                self._feed("gps0.position", second + 1e-3, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
+                self._feed("gps0.velocity", second + 1e-3, GnssVelocity(0.0, 0.0, 0.0, 0.1))
         self._engine.finish()
 
-    def _take(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
+    def _feed(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
         t_ns = 1_700_000_000 * SECOND + round(second * SECOND)
         assert self._engine.feed(Received(source, t_ns, "unix", t_ns, t_ns, payload)) is not None
 
@@ -46,7 +46,7 @@ def test_a_reset_is_published_with_its_reason(tmp_path: Path) -> None:
     player = Player(settings)
     player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
     messages = player.told
-    why = "gps0.position was rejected too long with a constant error; the state was set to it"
+    why = "gps0.position: rejected with a constant error for too long; the state was set to it"
     events = [message for message in messages if isinstance(message, EventMessage)]
     assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
     assert [message.subject for message in events if message.kind == "mode"] == [

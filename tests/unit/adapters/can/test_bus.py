@@ -1,4 +1,4 @@
-"""A CAN bus: what its error frames say."""
+"""A CAN bus: its error frames, and the lines of its log."""
 
 from __future__ import annotations
 
@@ -41,3 +41,20 @@ def test_error_frames_are_counted_and_a_change_is_told(tmp_path: Path, caplog: p
     assert lines == ["error-warning", "error-passive", "bus-off", "active"]
     expected = {"error frames": 7, "error passive": 2, "error warning": 1, "bus off": 1, "restarted": 1}
     assert (expected | {"controller overflow": 1}).items() <= bus.counts().items()
+
+
+def test_frames_are_recorded_as_candump_writes_them(tmp_path: Path) -> None:
+    bus = CanBus(configuration(tmp_path, "udpin:127.0.0.1:14550"), "car", Inbox(16, lambda: None, hash), HostClock())
+    t_ns = 1_700_000_000_123_456_000
+    lines = [
+        (CanFrame(0x100, False, b"\x01\xab"), "100#01AB"),
+        (CanFrame(0x100, True, b""), "00000100#"),
+        (CanFrame(0x100, False, b"\x01", fd_flags=1), "100##101"),
+        (CanFrame(0x100, False, b"", is_remote=True), "100#R"),
+        (CanFrame(0x40, False, bytes(8), is_error=True), "20000040#0000000000000000"),
+    ]
+    for frame, text in lines:
+        assert bus.record(frame, t_ns) == f"(1700000000.123456) car {text}\n".encode()
+    bus.decode(lines[-1][0], t_ns)
+    bus.decode(lines[-2][0], t_ns)
+    assert {"error frames": 1, "bus off": 1, "remote frames": 1}.items() <= bus.counts().items()

@@ -1,14 +1,16 @@
-"""The units: sound to systemd, closed to what the service does not need, alike but for the instance's name."""
+"""Notifications to systemd, and the units: valid, confined, identical except for the instance's name."""
 
 from __future__ import annotations
 
 import re
 import shutil
+import socket
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from fusiond_adapters.host.systemd import Notifier, watchdog_s
 from tests.helpers.paths import ROOT
 
 SYSTEMD = ROOT / "systemd"
@@ -54,3 +56,21 @@ def test_the_watchdog_and_the_exit_codes_agree_with_the_daemon() -> None:
     text = (SYSTEMD / UNITS[0]).read_text()
     for line in ("Type=notify", "WatchdogSec=5", "Restart=on-failure", "RestartPreventExitStatus=2"):
         assert f"\n{line}\n" in text
+
+
+def test_notifications(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.settimeout(10)
+        manager.bind(str(tmp_path / "notify"))
+        notifier = Notifier(str(tmp_path / "notify"))
+        notifier.ready("well")
+        notifier.reloading()
+        assert manager.recv(100) == b"READY=1\nSTATUS=well"
+        assert manager.recv(100).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
+    notifier.stopping()
+    assert notifier.lost == 1
+    notifier.close()
+    monkeypatch.setenv("WATCHDOG_USEC", "5000000")
+    assert watchdog_s() == 2.5
+    monkeypatch.setenv("WATCHDOG_PID", "1")
+    assert watchdog_s() is None

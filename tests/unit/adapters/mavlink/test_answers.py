@@ -53,76 +53,76 @@ def int_(command: int, *values: float) -> Any:
 )
 def test_commands_are_answered(peer: UdpListener, tmp_path: Path, message: Any, result: int | None) -> None:
     station, now = station_at(peer.connection, tmp_path)
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     with serving(station):
         station.outbox.put(state_at(now()))
-        ear.until(lambda: bool(ear.of("HEARTBEAT")))
-        ear.say(message)
-        ear.say(common.MAVLink_param_request_read_message(SYSTEM, 191, b"FUS_RATE_HZ", -1))
-        ear.until(lambda: bool(ear.of("PARAM_VALUE")))  # what came before it has been dealt with
-    answers = [(m.command, m.result, m.target_system, m.target_component) for m in ear.of("COMMAND_ACK")]
+        endpoint.until(lambda: bool(endpoint.of("HEARTBEAT")))
+        endpoint.send(message)
+        endpoint.send(common.MAVLink_param_request_read_message(SYSTEM, 191, b"FUS_RATE_HZ", -1))
+        endpoint.until(lambda: bool(endpoint.of("PARAM_VALUE")))  # what came before it has been dealt with
+    answers = [(m.command, m.result, m.target_system, m.target_component) for m in endpoint.of("COMMAND_ACK")]
     assert answers == ([] if result is None else [(message.command, result, STATION, 190)])
 
 
 def test_commands_change_what_is_sent(peer: UdpListener, tmp_path: Path) -> None:
     station, now = station_at(peer.connection, tmp_path)
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     stamps = iter(range(now() - 4000 * MS, now(), 40 * MS))
 
     def offered(count: int) -> int:
         """How many of so many states were told of."""
-        places, attitudes = (len(ear.of(name)) for name in (STREAMS[0], STREAMS[2]))
+        places, attitudes = (len(endpoint.of(name)) for name in (STREAMS[0], STREAMS[2]))
         for _ in range(count):
             station.outbox.put(state_at(next(stamps)))
-        ear.until(lambda: len(ear.of(STREAMS[2])) == attitudes + count)
-        return len(ear.of(STREAMS[0])) - places
+        endpoint.until(lambda: len(endpoint.of(STREAMS[2])) == attitudes + count)
+        return len(endpoint.of(STREAMS[0])) - places
 
     def interval_us() -> int:
-        known = len(ear.of("MESSAGE_INTERVAL"))
-        ear.say(long(GET, GLOBAL))
-        ear.until(lambda: len(ear.of("MESSAGE_INTERVAL")) > known)
-        return int(ear.of("MESSAGE_INTERVAL")[-1].interval_us)
+        known = len(endpoint.of("MESSAGE_INTERVAL"))
+        endpoint.send(long(GET, GLOBAL))
+        endpoint.until(lambda: len(endpoint.of("MESSAGE_INTERVAL")) > known)
+        return int(endpoint.of("MESSAGE_INTERVAL")[-1].interval_us)
 
     with serving(station):
         assert offered(5) == 5
         assert interval_us() == 40_000
-        ear.say(long(SET, GLOBAL, 80_000))
+        endpoint.send(long(SET, GLOBAL, 80_000))
         assert interval_us() == 80_000
         assert offered(6) == 3
-        ear.say(long(SET, GLOBAL, -1))
+        endpoint.send(long(SET, GLOBAL, -1))
         assert interval_us() == -1
         assert offered(5) == 0
-        ear.say(long(REQUEST, GLOBAL))
+        endpoint.send(long(REQUEST, GLOBAL))
         assert interval_us() == -1
         assert offered(5) == 1
-        ear.say(long(SET, GLOBAL, 0))
+        endpoint.send(long(SET, GLOBAL, 0))
         assert interval_us() == 40_000
-        ear.say(long(REQUEST, 148))
-        ear.until(lambda: bool(ear.of("AUTOPILOT_VERSION")))
+        endpoint.send(long(REQUEST, 148))
+        endpoint.until(lambda: bool(endpoint.of("AUTOPILOT_VERSION")))
 
 
 def test_parameters(peer: UdpListener, tmp_path: Path) -> None:
     rate = [30.0]
     shared = Parameter("AP_RATE_HZ", lambda: rate[0], lambda value: rate.__setitem__(0, value), 4.0, 50.0)
     station, now = station_at(peer.connection, tmp_path, parameters=(shared,))
-    ear = from_station(peer)
+    endpoint = from_station(peer)
 
     def asked(message: Any, count: int = 1) -> list[tuple[str, float]]:
-        before = len(ear.of("PARAM_VALUE"))
-        ear.say(message)
-        ear.until(lambda: len(ear.of("PARAM_VALUE")) >= before + count)
-        return [(m.param_id, round(m.param_value, 3)) for m in ear.of("PARAM_VALUE")[before:]]
+        before = len(endpoint.of("PARAM_VALUE"))
+        endpoint.send(message)
+        endpoint.until(lambda: len(endpoint.of("PARAM_VALUE")) >= before + count)
+        return [(m.param_id, round(m.param_value, 3)) for m in endpoint.of("PARAM_VALUE")[before:]]
 
     def put(name: str, value: float) -> list[tuple[str, float]]:
         return asked(common.MAVLink_param_set_message(SYSTEM, 191, name.encode(), value, 9))
 
     with serving(station):
         station.outbox.put(state_at(now()))
-        ear.until(lambda: bool(ear.of("HEARTBEAT")))
+        endpoint.until(lambda: bool(endpoint.of("HEARTBEAT")))
         whole = [("FUS_RATE_HZ", 100.0), ("FUS_HORIZON_S", 1.0), ("GS_RATE_HZ", 25.0), ("AP_RATE_HZ", 30.0)]
         assert asked(common.MAVLink_param_request_list_message(SYSTEM, 0), 4) == whole
-        assert {(m.param_count, m.param_type) for m in ear.of("PARAM_VALUE")} == {(4, 9)}
-        assert [m.param_index for m in ear.of("PARAM_VALUE")] == [0, 1, 2, 3]
+        assert {(m.param_count, m.param_type) for m in endpoint.of("PARAM_VALUE")} == {(4, 9)}
+        assert [m.param_index for m in endpoint.of("PARAM_VALUE")] == [0, 1, 2, 3]
         assert asked(common.MAVLink_param_request_read_message(SYSTEM, 191, b"", 1)) == whole[1:2]
         assert asked(common.MAVLink_param_request_read_message(SYSTEM, 191, b"AP_RATE_HZ", -1)) == whole[3:]
         assert put("AP_RATE_HZ", 12.5) == [("AP_RATE_HZ", 12.5)] and rate == [12.5]
@@ -130,7 +130,7 @@ def test_parameters(peer: UdpListener, tmp_path: Path) -> None:
         assert put("AP_RATE_HZ", math.nan) == [("AP_RATE_HZ", 12.5)]
         assert put("FUS_RATE_HZ", 10.0) == [("FUS_RATE_HZ", 100.0)]  # read-only
         assert put("GS_RATE_HZ", 5.0) == [("GS_RATE_HZ", 5.0)]
-        ear.say(common.MAVLink_param_request_read_message(SYSTEM, 191, b"NONE", -1))
-        ear.say(common.MAVLink_param_request_read_message(SYSTEM, 191, b"", 99))
+        endpoint.send(common.MAVLink_param_request_read_message(SYSTEM, 191, b"NONE", -1))
+        endpoint.send(common.MAVLink_param_request_read_message(SYSTEM, 191, b"", 99))
         assert asked(common.MAVLink_param_request_read_message(SYSTEM, 191, b"", 2)) == [("GS_RATE_HZ", 5.0)]
-    assert station.paces[GLOBAL].rate_hz == 5.0
+    assert station.limiters[GLOBAL].rate_hz == 5.0

@@ -17,7 +17,7 @@ from fusiond.estimator.solution import Mode
 from fusiond.maths.rotation import euler, matrix
 from fusiond.messages.types import State, StateMessage
 from fusiond_adapters.mavlink.autopilot import AutopilotOutput, Readback
-from fusiond_adapters.mavlink.outgoing import FORMS, Origin, odometry
+from fusiond_adapters.mavlink.outgoing import CONVENTIONS, Origin, odometry
 from tests.helpers.live import configuration
 from tests.helpers.mavlink_peers import (
     CLOCK,
@@ -25,7 +25,7 @@ from tests.helpers.mavlink_peers import (
     MS,
     SYSTEM,
     ArduPilot,
-    Ear,
+    Endpoint,
     Peer,
     Px4,
     Recorder,
@@ -74,33 +74,33 @@ def test_the_autopilot_gets_the_state(peer: Peer, kind: str, message: str, tmp_p
     settings, link = link_to(peer, tmp_path, f'{ON}kind = "{kind}"\nmessage = "{message}"\n')
     output = AutopilotOutput(settings, link, CLOCK.now_ns)
     states = recent(8, resets=259)
-    ear = Ear(peer)
+    endpoint = Endpoint(peer)
     names = ("ODOMETRY", "VISION_POSITION_ESTIMATE")
     maker = dialect.MAV_AUTOPILOT_PX4 if kind == "px4" else dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
     with serving(link, output):
-        greeted(ear, link, maker)
+        greeted(endpoint, link, maker)
         for state in states:
             output.outbox.put(state)
-        ear.until(lambda: len(ear.of(*names)) == len(states))
-    sent = ear.of(*names)
+        endpoint.until(lambda: len(endpoint.of(*names)) == len(states))
+    sent = endpoint.of(*names)
     assert {(m.get_srcSystem(), m.get_srcComponent()) for m in sent} == {(SYSTEM, 191)}
     autopilot = AUTOPILOTS[kind](position_of(states[0]))
     for m, state in zip(sent, states, strict=True):
-        taken = autopilot.take(m)
-        assert taken is not None
+        accepted = autopilot.accept(m)
+        assert accepted is not None
         want = state_of(state)
         metre = 1e-5  # deg
-        assert taken.time_us == state.t_ns // 1000
-        assert taken.latitude_deg == pytest.approx(want.lat_deg, abs=1e-3 * metre)
-        assert taken.longitude_deg == pytest.approx(want.lon_deg, abs=1e-3 * metre)
-        assert taken.height_m == pytest.approx(want.height_m, abs=1e-5)
-        assert taken.quaternion is not None
-        assert abs(np.dot(taken.quaternion, want.quaternion_nb)) == pytest.approx(1, abs=1e-6)
-        assert taken.reset_counter == 259 % 256
+        assert accepted.time_us == state.t_ns // 1000
+        assert accepted.latitude_deg == pytest.approx(want.lat_deg, abs=1e-3 * metre)
+        assert accepted.longitude_deg == pytest.approx(want.lon_deg, abs=1e-3 * metre)
+        assert accepted.height_m == pytest.approx(want.height_m, abs=1e-5)
+        assert accepted.quaternion is not None
+        assert abs(np.dot(accepted.quaternion, want.quaternion_nb)) == pytest.approx(1, abs=1e-6)
+        assert accepted.reset_counter == 259 % 256
         if message == "odometry":
-            assert taken.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
-            assert 1 <= taken.quality <= 100
-        check_variances(taken.variances, want, kind)
+            assert accepted.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
+            assert 1 <= accepted.quality <= 100
+        check_variances(accepted.variances, want, kind)
 
 
 def check_variances(variances: tuple[float, ...], want: State, kind: str) -> None:
@@ -119,17 +119,18 @@ def test_what_pleases_one_autopilot_is_refused_by_the_other() -> None:
     message = state_at(10**18, 3)
     origin = Origin.of(state_of(message))
     here = position_of(message)
-    to_px4, to_ardupilot = (odometry(message, state_of(message), origin, FORMS[kind], 50) for kind in ("px4", "ardupilot"))
+    to_px4 = odometry(message, state_of(message), origin, CONVENTIONS["px4"], 50)
+    to_ardupilot = odometry(message, state_of(message), origin, CONVENTIONS["ardupilot"], 50)
     ardupilot, px4 = ArduPilot(here), Px4(here)
-    assert ardupilot.take(to_px4) is None and ardupilot.dropped == 1
-    assert px4.take(to_ardupilot) is None and px4.refused == 1
+    assert ardupilot.accept(to_px4) is None and ardupilot.dropped == 1
+    assert px4.accept(to_ardupilot) is None and px4.refused == 1
     to_px4.estimator_type = dialect.MAV_ESTIMATOR_TYPE_GPS_INS
-    assert px4.take(to_px4) is None
+    assert px4.accept(to_px4) is None
     to_px4.estimator_type = dialect.MAV_ESTIMATOR_TYPE_NAIVE
-    naive = px4.take(to_px4)
+    naive = px4.accept(to_px4)
     assert naive is not None and naive.variances == ()
     to_ardupilot.quality = -1
-    assert ardupilot.take(to_ardupilot) is None
+    assert ardupilot.accept(to_ardupilot) is None
 
 
 def test_gps_input(udp: UdpPeer, tmp_path: Path) -> None:
@@ -137,27 +138,27 @@ def test_gps_input(udp: UdpPeer, tmp_path: Path) -> None:
     settings = msgspec.structs.replace(settings, vehicle=msgspec.structs.replace(settings.vehicle, geoid_m=47.5))
     output = AutopilotOutput(settings, link, CLOCK.now_ns)
     states = recent(5)
-    ear = Ear(udp)
+    endpoint = Endpoint(udp)
     with serving(link, output):
-        greeted(ear, link)
+        greeted(endpoint, link)
         for state in states:
             output.outbox.put(state)
-        ear.until(lambda: len(ear.of("GPS_INPUT")) == len(states))
+        endpoint.until(lambda: len(endpoint.of("GPS_INPUT")) == len(states))
     autopilot = ArduPilot(position_of(states[0]))
-    for m, state in zip(ear.of("GPS_INPUT"), states, strict=True):
-        taken = autopilot.take(m)
+    for m, state in zip(endpoint.of("GPS_INPUT"), states, strict=True):
+        accepted = autopilot.accept(m)
         want = state_of(state)
-        assert m.gps_id == 1 and taken is not None and taken.quaternion is not None
-        assert (taken.latitude_deg, taken.longitude_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-7)
-        assert taken.height_m == pytest.approx(want.height_m - 47.5, abs=1e-4)
-        assert taken.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
-        yaw = math.degrees(euler(matrix(np.array(taken.quaternion)))[2])
+        assert m.gps_id == 1 and accepted is not None and accepted.quaternion is not None
+        assert (accepted.latitude_deg, accepted.longitude_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-7)
+        assert accepted.height_m == pytest.approx(want.height_m - 47.5, abs=1e-4)
+        assert accepted.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
+        yaw = math.degrees(euler(matrix(np.array(accepted.quaternion)))[2])
         assert math.remainder(yaw - want.yaw_deg, 360) == pytest.approx(0, abs=0.01)
-        assert taken.variances[:2] == pytest.approx(
+        assert accepted.variances[:2] == pytest.approx(
             (max(want.sigma_position_ned_m[:2]), want.sigma_position_ned_m[2]), rel=1e-5
         )
         gps_epoch_to_unix_us = (315_964_800 - 18) * 10**6
-        assert taken.time_us + gps_epoch_to_unix_us == pytest.approx(state.t_ns / 1000, abs=1000)
+        assert accepted.time_us + gps_epoch_to_unix_us == pytest.approx(state.t_ns / 1000, abs=1000)
 
 
 # --- Numbers
@@ -182,17 +183,17 @@ def test_an_unfit_state_is_not_sent_and_it_is_said_once(
 ) -> None:
     settings, link = link_to(udp, tmp_path, ON + LIMITS)
     output = AutopilotOutput(settings, link, CLOCK.now_ns)
-    ear = Ear(udp)
+    endpoint = Endpoint(udp)
     with np.errstate(invalid="ignore"):
         states = recent(6, **changes)
     with serving(link, output):
-        greeted(ear, link)
+        greeted(endpoint, link)
         for state in states:
             output.outbox.put(state)
-        ear.until(lambda: output.counts()["not fit"] == len(states) and bool(ear.texts()))
-    assert not ear.of("ODOMETRY")
-    assert len(ear.texts()) == 1
-    assert ear.texts()[0].startswith("fusiond: not sent to the autopilot: ") and reason in ear.texts()[0]
+        endpoint.until(lambda: output.counts()["not fit"] == len(states) and bool(endpoint.texts()))
+    assert not endpoint.of("ODOMETRY")
+    assert len(endpoint.texts()) == 1
+    assert endpoint.texts()[0].startswith("fusiond: not sent to the autopilot: ") and reason in endpoint.texts()[0]
     assert output.notes()["sending"].startswith("no: ") and reason in output.notes()["sending"]
 
 
@@ -245,16 +246,16 @@ def test_quality_falls_with_the_sigmas(tmp_path: Path) -> None:
 
 def test_the_origin_is_set_until_the_autopilot_names_one(tmp_path: Path) -> None:
     output, link = made(tmp_path, f"{ON}set_origin = true\n")
-    voice = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    sender = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     heartbeat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GROUND_ROVER, 3, 0, 0, 4, 3)
-    link.talk.hear(bytes(heartbeat.pack(voice)), 0)
+    link.housekeeping.receive(bytes(heartbeat.pack(sender)), 0)
     output.offer(state_at(10**18 - 900 * MS))
     state = state_of(state_at(0))
     set_to = link.sent[1]
     assert set_to.get_type() == "SET_GPS_GLOBAL_ORIGIN" and set_to.target_system == SYSTEM
     assert set_to.latitude == round(state.lat_deg * 1e7) and set_to.altitude == round(state.height_m * 1e3)
     theirs = dialect.MAVLink_gps_global_origin_message(set_to.latitude + 10_000, set_to.longitude, set_to.altitude, 0)
-    output.readback.hear(bytes(theirs.pack(voice)), 0)
+    output.readback.receive(bytes(theirs.pack(sender)), 0)
     output.offer(state_at(10**18 + 3000 * MS))
     assert link.kinds().count("SET_GPS_GLOBAL_ORIGIN") == 1
     assert output.notes()["origin"] == "the autopilot's local frame begins 111.3 m from ours"
@@ -282,7 +283,7 @@ VERDICTS: list[tuple[str, list[Any], str]] = [
     ("ardupilot", [report(GOOD, 0.3)], "likely: it has a position, worst test ratio 0.30"),
     ("ardupilot", [report(GOOD, 0.3), text("EKF3 IMU0 is using external nav data")], "yes"),
     ("ardupilot", [text("EKF3 IMU0 is using external nav data"), report(GOOD, 1.4)], "no: it rejects"),
-    ("ardupilot", [report(GOOD, 0.3), text("EKF3 IMU0 stopped aiding")], "no: it said that it stopped aiding"),
+    ("ardupilot", [report(GOOD, 0.3), text("EKF3 IMU0 stopped aiding")], "no: it reported that it stopped aiding"),
     ("ardupilot", [report(GOOD | 1024, 0.3)], "no: its estimator is not initialised"),
     ("ardupilot", [report(0x87, 0.3)], "no: it assumes a constant position"),
     ("ardupilot", [report(0x27, 0.3)], "no: it has no horizontal position"),
@@ -296,13 +297,13 @@ VERDICTS: list[tuple[str, list[Any], str]] = [
 @pytest.mark.parametrize(("kind", "messages", "verdict"), VERDICTS)
 def test_whether_the_autopilot_uses_us(tmp_path: Path, kind: str, messages: list[Any], verdict: str) -> None:
     link: Any = Recorder(configuration(tmp_path, "udpin:127.0.0.1:1", ON))
-    link.talk.target = (SYSTEM, COMPONENT)
+    link.housekeeping.target = (SYSTEM, COMPONENT)
     readback = Readback(link, kind)
-    voice = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    sender = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     other = dialect.MAVLink(None, srcSystem=SYSTEM + 1, srcComponent=COMPONENT)
-    readback.hear(bytes(report(0, 9.0).pack(other)), 0)  # another vehicle's is not ours
+    readback.receive(bytes(report(0, 9.0).pack(other)), 0)  # another vehicle's is not ours
     for message in messages:
-        readback.hear(bytes(message.pack(voice)), 0)
+        readback.receive(bytes(message.pack(sender)), 0)
     assert readback.verdict(1000 * MS).startswith(verdict)
     if verdict.startswith(("likely", "yes")):
         assert readback.verdict(6000 * MS).startswith("unknown")
@@ -312,14 +313,14 @@ def test_the_autopilot_is_asked_for_its_status_and_it_is_read_back(udp: UdpPeer,
     """On a link of the dialect `common`, to which EKF_STATUS_REPORT is unknown."""
     settings, link = link_to(udp, tmp_path, ON)
     output = AutopilotOutput(settings, link, CLOCK.now_ns)
-    ear = Ear(udp)
+    endpoint = Endpoint(udp)
     with serving(link, output):
-        greeted(ear, link)
-        ear.until(lambda: any(m.param1 == 193 for m in ear.of("COMMAND_LONG") if m.command == 511))
-        ear.say(report(GOOD, 0.25))
-        ear.say(text("EKF3 IMU0 is using external nav data"))
-        ear.heartbeat()
-        ear.until(lambda: output.notes()["used"].startswith("yes"))
+        greeted(endpoint, link)
+        endpoint.until(lambda: any(m.param1 == 193 for m in endpoint.of("COMMAND_LONG") if m.command == 511))
+        endpoint.send(report(GOOD, 0.25))
+        endpoint.send(text("EKF3 IMU0 is using external nav data"))
+        endpoint.heartbeat()
+        endpoint.until(lambda: output.notes()["used"].startswith("yes"))
     assert not link.listeners
 
 
@@ -329,10 +330,10 @@ def test_the_autopilot_is_asked_for_its_status_and_it_is_read_back(udp: UdpPeer,
 def test_a_stalled_peer_delays_nobody_and_tears_no_frame(tmp_path: Path) -> None:
     stalled = TcpPeer(buffer=4096)
     _, link = link_to(stalled, tmp_path, ON)
-    ear = Ear(stalled)
-    message = odometry(state_at(0), state_of(state_at(0)), Origin.of(state_of(state_at(0))), FORMS["ardupilot"], 50)
+    endpoint = Endpoint(stalled)
+    message = odometry(state_at(0), state_of(state_at(0)), Origin.of(state_of(state_at(0))), CONVENTIONS["ardupilot"], 50)
     with serving(link):
-        greeted(ear, link)
+        greeted(endpoint, link)
         slowest, lost, tries = 0.0, 0, 0
         while lost < 1000 and tries < 100_000:
             began = time.monotonic()
@@ -341,10 +342,10 @@ def test_a_stalled_peer_delays_nobody_and_tears_no_frame(tmp_path: Path) -> None
             tries += 1
         assert lost == 1000
         assert slowest < 0.2
-        ear.until(lambda: len(ear.of("ODOMETRY")) > 0)
+        endpoint.until(lambda: len(endpoint.of("ODOMETRY")) > 0)
         link.send(message)  # the rest of the one that was half taken, then this one
-        ear.until(lambda: len(ear.of("ODOMETRY")) == tries - lost + 1 or link.send(message))
-    assert not ear.of("BAD_DATA")
+        endpoint.until(lambda: len(endpoint.of("ODOMETRY")) == tries - lost + 1 or link.send(message))
+    assert not endpoint.of("BAD_DATA")
     stalled.close()
 
 

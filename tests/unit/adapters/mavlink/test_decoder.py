@@ -222,7 +222,7 @@ def test_the_first_autopilot_is_followed() -> None:
         assert reader.decode(frame, T_NS) == []
     assert reader.system == 0
     reader.decode(autopilot.heartbeat(autopilot=0), T_NS)
-    assert (reader.system, reader.settled) == (42, True)
+    assert (reader.system, reader.found) == (42, True)
     assert one(reader.decode(autopilot.highres(), T_NS)).clock == "fc/42/boot"
     assert reader.decode(gimbal.highres(), T_NS) == []
     reader.decode(Sender(43).heartbeat(), T_NS)

@@ -34,7 +34,7 @@ from tests.helpers.mavlink_peers import (
     CLOCK,
     MS,
     SYSTEM,
-    Ear,
+    Endpoint,
     TcpPeer,
     UdpListener,
     UdpPeer,
@@ -63,14 +63,14 @@ def event(text: str, severity: Severity = "warning") -> EventMessage:
 def test_the_ground_station_gets_the_state(peer: UdpListener, tmp_path: Path) -> None:
     station, _ = station_at(peer.connection, tmp_path)
     states = recent(6)
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     with serving(station):
         for message in states:
             station.outbox.put(message)
-        ear.until(lambda: len(ear.of(*STREAMS)) == 3 * len(states))
+        endpoint.until(lambda: len(endpoint.of(*STREAMS)) == 3 * len(states))
     assert states[0].state is not None
     for number, message in enumerate(states):
-        place, local, attitude = (ear.of(name)[number] for name in STREAMS)
+        place, local, attitude = (endpoint.of(name)[number] for name in STREAMS)
         assert {m.time_usec for m in (place, local, attitude)} == {message.t_ns // 1000}
         assert message.state is not None
         check_place(place, message.state, states[0].state)
@@ -78,7 +78,7 @@ def test_the_ground_station_gets_the_state(peer: UdpListener, tmp_path: Path) ->
         assert attitude.q == pytest.approx(message.state.quaternion_nb, abs=1e-6)
         rates = attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed
         assert rates == pytest.approx(message.state.angular_rate_b_rps, abs=1e-7)
-    assert not ear.of("GLOBAL_POSITION_INT", "GPS_RAW_INT", "BAD_DATA")
+    assert not endpoint.of("GLOBAL_POSITION_INT", "GPS_RAW_INT", "BAD_DATA")
 
 
 def check_place(m: Any, state: State, first: State) -> None:
@@ -110,7 +110,7 @@ def check_local(m: Any, state: State, first: State) -> None:
 
 def test_estimator_status_tells_ratios_and_whether_there_is_a_position(peer: UdpListener, tmp_path: Path) -> None:
     station, _ = station_at(peer.connection, tmp_path)
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     counts = OutcomeCounts()
     judged = {"gps0.position": 0.25, "gps0.velocity": 0.04, "left": 0.81, "right": None}
     sources = {name: SourceHealth(outcomes=counts, present=True, test_ratio=value) for name, value in judged.items()}
@@ -121,8 +121,8 @@ def test_estimator_status_tells_ratios_and_whether_there_is_a_position(peer: Udp
     with serving(station):
         for message in (health, good, lost):
             station.outbox.put(message)
-        ear.until(lambda: len(ear.of("ESTIMATOR_STATUS")) == 2)
-    first, second = ear.of("ESTIMATOR_STATUS")
+        endpoint.until(lambda: len(endpoint.of("ESTIMATOR_STATUS")) == 2)
+    first, second = endpoint.of("ESTIMATOR_STATUS")
     assert (first.vel_ratio, first.pos_horiz_ratio, first.pos_vert_ratio) == pytest.approx((0.9, 0.5, 0.5))
     assert math.isnan(first.mag_ratio)
     assert good.state is not None
@@ -130,7 +130,7 @@ def test_estimator_status_tells_ratios_and_whether_there_is_a_position(peer: Udp
     assert (first.pos_horiz_accuracy, first.pos_vert_accuracy) == pytest.approx((math.hypot(north, east), down))
     absolute = common.ESTIMATOR_POS_HORIZ_ABS
     assert first.flags & absolute and not second.flags & absolute
-    assert len(ear.of("GLOBAL_POSITION_INT_COV")) == 1  # none of the lost one
+    assert len(endpoint.of("GLOBAL_POSITION_INT_COV")) == 1  # none of the lost one
     assert all(map(math.isnan, ratios(msgspec.structs.replace(health, sources={}), settings_for(peer.connection, tmp_path))))
 
 
@@ -143,22 +143,22 @@ def test_texts_survive_their_chunks(length: int) -> None:
     chunks = list(status_texts(4, text, 9))
     assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
     assert {chunk.id for chunk in chunks} == {0 if length <= 50 else 9}
-    voice, parser = common.MAVLink(None), common.MAVLink(None)
-    read = [parser.decode(bytearray(chunk.pack(voice))).text for chunk in chunks]
+    sender, parser = common.MAVLink(None), common.MAVLink(None)
+    read = [parser.decode(bytearray(chunk.pack(sender))).text for chunk in chunks]
     assert "".join(read) == text
     assert length <= 50 or [len(part) == 50 for part in read] == [True] * (len(read) - 1) + [False]
 
 
 def test_events_are_told(peer: UdpListener, tmp_path: Path) -> None:
     station, _ = station_at(peer.connection, tmp_path)
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     long = "gps0.position has been silent for 12.5 s; the last fix was rejected, and before that came 14 which were fused"
     with serving(station):
         for message in (event("mode: aligning -> nominal", "info"), event(long), event("left slips", "critical")):
             station.outbox.put(message)
-        ear.until(lambda: len(ear.texts()) == 3)
-    assert ear.texts() == ["fusiond: mode: aligning -> nominal", f"fusiond: {long}", "fusiond: left slips"]
-    assert [m.severity for m in ear.of("STATUSTEXT") if m.chunk_seq == 0] == [6, 4, 2]
+        endpoint.until(lambda: len(endpoint.texts()) == 3)
+    assert endpoint.texts() == ["fusiond: mode: aligning -> nominal", f"fusiond: {long}", "fusiond: left slips"]
+    assert [m.severity for m in endpoint.of("STATUSTEXT") if m.chunk_seq == 0] == [6, 4, 2]
 
 
 # --- Heartbeats and the marker
@@ -166,36 +166,37 @@ def test_events_are_told(peer: UdpListener, tmp_path: Path) -> None:
 
 def test_heartbeats_stop_when_the_estimator_does(peer: UdpListener, tmp_path: Path) -> None:
     station, now = station_at(peer.connection, tmp_path, f"marker_system = {MARKER}\n")
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     with serving(station):
         station.outbox.put(state_at(now()))
-        ear.until(lambda: len(ear.of("HEARTBEAT")) == 2)
+        endpoint.until(lambda: len(endpoint.of("HEARTBEAT")) == 2)
         now.ahead_ns += 3 * 10**9  # no state for three seconds
         for turn in (1, 2):  # a heartbeat after the first answers would have come before the second
-            ear.say(common.MAVLink_param_request_list_message(SYSTEM, 191))
-            ear.until(lambda turn=turn: len(ear.of("PARAM_VALUE")) == 3 * turn)
-        assert len(ear.of("HEARTBEAT")) == 2
+            endpoint.send(common.MAVLink_param_request_list_message(SYSTEM, 191))
+            endpoint.until(lambda turn=turn: len(endpoint.of("PARAM_VALUE")) == 3 * turn)
+        assert len(endpoint.of("HEARTBEAT")) == 2
         station.outbox.put(state_at(now()))
-        ear.until(lambda: len(ear.of("HEARTBEAT")) == 4)
-    ours, mark = ear.of("HEARTBEAT")[:2]
+        endpoint.until(lambda: len(endpoint.of("HEARTBEAT")) == 4)
+    ours, mark = endpoint.of("HEARTBEAT")[:2]
     assert (ours.get_srcSystem(), ours.get_srcComponent(), ours.type, ours.autopilot) == (SYSTEM, 191, 18, 8)
     assert (mark.get_srcSystem(), mark.get_srcComponent(), mark.type) == (MARKER, 1, common.MAV_TYPE_GROUND_ROVER)
 
 
 def test_the_marker_alone_says_where_a_vehicle_is(peer: UdpListener, tmp_path: Path) -> None:
     station, now = station_at(peer.connection, tmp_path, f"marker_system = {MARKER}\n")
-    ear = from_station(peer)
+    endpoint = from_station(peer)
     state = state_at(now(), 3)
     with serving(station):
         station.outbox.put(state)
-        ear.until(lambda: bool(ear.of("GLOBAL_POSITION_INT")))
-        ear.say(common.MAVLink_command_long_message(MARKER, 1, common.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0))
-        ear.until(lambda: bool(ear.of("COMMAND_ACK")))
-    (mark,) = ear.of("GLOBAL_POSITION_INT")
+        endpoint.until(lambda: bool(endpoint.of("GLOBAL_POSITION_INT")))
+        arm = common.MAV_CMD_COMPONENT_ARM_DISARM
+        endpoint.send(common.MAVLink_command_long_message(MARKER, 1, arm, 0, 1, 0, 0, 0, 0, 0, 0))
+        endpoint.until(lambda: bool(endpoint.of("COMMAND_ACK")))
+    (mark,) = endpoint.of("GLOBAL_POSITION_INT")
     assert state.state is not None
     assert mark.get_srcSystem() == MARKER and mark.hdg == round(state.state.yaw_deg % 360 * 100)
     assert (mark.lat, mark.lon) == (round(state.state.lat_deg * 1e7), round(state.state.lon_deg * 1e7))
-    (answer,) = ear.of("COMMAND_ACK")
+    (answer,) = endpoint.of("COMMAND_ACK")
     assert (answer.get_srcSystem(), answer.result) == (MARKER, common.MAV_RESULT_UNSUPPORTED)
 
 
@@ -212,16 +213,16 @@ def test_over_the_link_of_an_input(tmp_path: Path) -> None:
     peer = UdpPeer()
     settings, link = link_to(peer, tmp_path, '[ground_station]\nlink = "fc"\nrate_hz = 25.0\n')
     station = GroundStation(settings, {"mavlink.fc": link}, CLOCK.now_ns)
-    ear = Ear(peer)
+    endpoint = Endpoint(peer)
     with serving(link, station):
-        greeted(ear, link)
+        greeted(endpoint, link)
         for state in recent(4):
             station.outbox.put(state)
-        ear.until(lambda: len(ear.of(*STREAMS)) == 12)
-        ear.say(long(GET, GLOBAL))
-        ear.until(lambda: bool(ear.of("MESSAGE_INTERVAL")))
-    assert {m.get_srcSystem() for m in ear.messages} == {SYSTEM}
-    numbers = [m.get_seq() for m in ear.messages if m.get_srcComponent() == 191]
+        endpoint.until(lambda: len(endpoint.of(*STREAMS)) == 12)
+        endpoint.send(long(GET, GLOBAL))
+        endpoint.until(lambda: bool(endpoint.of("MESSAGE_INTERVAL")))
+    assert {m.get_srcSystem() for m in endpoint.messages} == {SYSTEM}
+    numbers = [m.get_seq() for m in endpoint.messages if m.get_srcComponent() == 191]
     assert numbers == [(numbers[0] + step) % 256 for step in range(len(numbers))]  # one counter, whoever speaks
     assert link.listeners == []
     peer.close()
@@ -240,8 +241,8 @@ def test_a_connection_that_goes_is_an_output_lost(tmp_path: Path) -> None:
             found.append(str(caught.value))
 
     with serving(Session()):
-        ear = Ear(peer)
-        ear.until(lambda: bool(ear.of("HEARTBEAT")))
+        endpoint = Endpoint(peer)
+        endpoint.until(lambda: bool(endpoint.of("HEARTBEAT")))
         peer.close()
         while not found:
             station.outbox.put(state_at(now()))
@@ -260,20 +261,20 @@ def test_the_daemon_feeds_autopilot_and_ground_station(peer: UdpListener, tmp_pa
         tmp_path, vehicle.connection,
         f'[autopilot]\nlink = "fc"\nyaw_sigma_deg = 30.0\nposition_sigma_m = 50.0\nvelocity_sigma_mps = 50.0\n'
         f'[ground_station]\nconnection = "{peer.connection}"\nrate_hz = 50.0\n')  # fmt: skip
-    autopilot, ear, station = Autopilot(), Ear(vehicle), from_station(peer)
+    autopilot, endpoint, station = Autopilot(), Endpoint(vehicle), from_station(peer)
 
     def turn() -> bool:
         vehicle.send(autopilot.heartbeat() + autopilot.imu())
         vehicle.send(autopilot.gps())
         station.listen()
-        return len(ear.of("ODOMETRY")) > 5 and len(station.of("GLOBAL_POSITION_INT_COV")) > 5 and bool(station.texts())
+        return len(endpoint.of("ODOMETRY")) > 5 and len(station.of("GLOBAL_POSITION_INT_COV")) > 5 and bool(station.texts())
 
     with running(settings) as run:
-        ear.until(turn)
+        endpoint.until(turn)
         told = [m for m in run.messages if m.state is not None]
         notes = run.daemon.outputs["autopilot"].notes()
     by_time = {m.t_ns // 1000: m for m in told}
-    for m in ear.of("ODOMETRY")[:5]:
+    for m in endpoint.of("ODOMETRY")[:5]:
         state = by_time[m.time_usec].state
         assert state is not None and m.q == pytest.approx(state.quaternion_nb, abs=1e-6)
     place = station.of("GLOBAL_POSITION_INT_COV")[0]

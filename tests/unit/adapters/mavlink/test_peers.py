@@ -17,7 +17,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.messages.codec import encode
 from fusiond.timeline.aligner import ClockReport
 from fusiond_adapters.logs.merge import open_logs
@@ -148,8 +148,8 @@ def test_replay_of_the_recording_measures_the_same_round_trips(tmp_path: Path, m
     with running(settings) as run, autopilot.flying():
         check(run, autopilot)
     told: list[bytes] = []
-    wants = Wants(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])
-    replay = Replay(settings, wants)
+    task = ReplayTask(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])
+    replay = Replay(settings, task)
     replay.run(open_logs([str(path) for path in (tmp_path / "box").iterdir()], settings))
     assert replay.engine.fusion.clock.report() == run.daemon.live.engine.fusion.clock.report()
     assert len(told) > 20

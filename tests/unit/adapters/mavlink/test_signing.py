@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import common
 from fusiond.config.load import load
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
+from fusiond_adapters.mavlink.housekeeping import SECOND, Housekeeping
 from fusiond_adapters.mavlink.signing import EPOCH_NS, MINUTE, TICK_NS, Signing
-from fusiond_adapters.mavlink.talk import SECOND, MavlinkTalk
 from tests.helpers.live import SYSTEM, Autopilot, configuration, parsed
 
 KEY = bytes(range(32))
@@ -47,7 +47,7 @@ def heartbeat(sender: common.MAVLink) -> bytes:
 
 
 def test_what_is_said_satisfies_pymavlink(settings: Config) -> None:
-    said = b"".join(MavlinkTalk(settings, "fc").say(second * SECOND, alive=True)[0] for second in range(3))
+    said = b"".join(Housekeeping(settings, "fc").due(second * SECOND, alive=True)[0] for second in range(3))
     reader = common.MAVLink(None)
     reader.signing.secret_key = KEY
     assert [message.get_type() for message in reader.parse_buffer(said)] == ["HEARTBEAT"] * 3
@@ -83,8 +83,8 @@ def test_unsigned_frames_where_they_may_come(tmp_path: Path) -> None:
 
 
 def stamps(settings: Config, frames: int) -> list[int]:
-    talk = MavlinkTalk(settings, "fc")
-    said = [talk.say(second * SECOND, alive=True)[0] for second in range(frames)]
+    housekeeping = Housekeeping(settings, "fc")
+    said = [housekeeping.due(second * SECOND, alive=True)[0] for second in range(frames)]
     return [int.from_bytes(frame[-12:-6], "little") for frame in said]
 
 
@@ -102,18 +102,18 @@ def test_the_disk_is_written_seldom_and_ahead(settings: Config, monkeypatch: pyt
     (last,) = stamps(settings, 1)
     kept = settings.path("stamp").read_text()
     assert int(kept) == last + MINUTE
-    talk = MavlinkTalk(settings, "fc")
+    housekeeping = Housekeeping(settings, "fc")
     for second in range(50):
-        talk.say(second * SECOND, alive=True)
+        housekeeping.due(second * SECOND, alive=True)
     assert int(settings.path("stamp").read_text()) == int(kept) + 1 + MINUTE  # once more, by the restart
 
 
 def test_a_disk_that_fails_is_counted_and_stops_nothing(settings: Config) -> None:
-    talk = MavlinkTalk(settings, "fc")
-    assert talk.signing is not None
+    housekeeping = Housekeeping(settings, "fc")
+    assert housekeeping.signing is not None
     settings.path("stamp.new").mkdir()
-    assert len(parsed(talk.say(0, alive=True)[0])) == 1
-    assert talk.signing.counts["timestamp not kept"] == 1
+    assert len(parsed(housekeeping.due(0, alive=True)[0])) == 1
+    assert housekeeping.signing.counts["timestamp not kept"] == 1
 
 
 @pytest.mark.parametrize("key", [KEY.hex().encode(), KEY.hex().encode() + b"\n"])

@@ -88,7 +88,7 @@ def test_diagnostics_tell_of_a_reset_at_once() -> None:
     assert calm["fusiond: wheel"].message == "absent"
     after = diagnosed(health(T0 + 10, resets=2, dropped=3))
     assert (after["fusiond: state"].level, after["fusiond: input mavlink.fc"].message) == (1, "3 dropped")
-    assert "pose in map jumped: gnss.position is believed again" in after["fusiond: state"].message
+    assert "pose in map jumped: gnss.position: rejected for too long" in after["fusiond: state"].message
     assert {pair.key: pair.value for pair in after["fusiond: state"].values}["resets"] == "2"
     later = diagnosed(health(T0 + 10 * SECOND, resets=2, dropped=3))
     assert (later["fusiond: state"].level, later["fusiond: input mavlink.fc"].level) == (0, 0)

@@ -80,7 +80,7 @@ def test_wrong_configuration_is_exit_code_2(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "fusiond", "run", "--config", str(tmp_path / "live.toml")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, check=False)
     assert done.returncode == 2
-    assert "mavlink.fc.connection: 'udpin:14550': HOST:PORT is wanted" in done.stderr
+    assert "mavlink.fc.connection: 'udpin:14550': HOST:PORT is needed" in done.stderr
 
 
 def test_a_dbc_that_does_not_fit_is_exit_code_2_and_never_up(tmp_path: Path, manager: socket.socket) -> None:

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.messages.codec import encode
@@ -59,10 +59,10 @@ def test_udp_and_can_align_and_publish(tmp_path: Path, channel: str, bus: can.Bu
     periods = {b.t_ns - a.t_ns for a, b in zip(run.messages, run.messages[1:], strict=False)}
     assert periods == {10_000_000}
     totals = run.daemon.live.engine.fusion.totals()
-    assert sum(totals.values()) == run.daemon.live.offered  # nothing unaccounted for
+    assert sum(totals.values()) == run.daemon.live.offered  # all are accounted for
 
 
-def test_an_input_that_takes_long_to_prepare_holds_up_nothing_else(
+def test_an_input_that_is_slow_to_prepare_delays_nothing_else(
     tmp_path: Path, channel: str, bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port, loaded, prepare = free_port(), Event(), CanBus.prepare
@@ -91,8 +91,8 @@ def test_a_peer_that_is_pymavlink(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("MAVLINK20", "1")
     port = free_port(socket.SOCK_STREAM)
     with running(configuration(tmp_path, f"{ours}:127.0.0.1:{port}")) as run:
-        source = run.daemon.inputs["mavlink.fc"]
-        run.until(lambda: source.counts()["sessions"] == 1)
+        link = run.daemon.inputs["mavlink.fc"]
+        run.until(lambda: link.counts()["sessions"] == 1)
         where = f"{theirs}:127.0.0.1:{port}"
         with closing(mavutil.mavlink_connection(where, source_system=SYSTEM, source_component=1, dialect="common")) as peer:
             peer.mav.heartbeat_send(common.MAV_TYPE_GROUND_ROVER, common.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 0)
@@ -103,20 +103,19 @@ def test_a_peer_that_is_pymavlink(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_requests_and_answers_over_tcp(tmp_path: Path) -> None:
-    """fusiond connects, learns the system, asks for the messages, asks again after a reboot, answers TIMESYNC."""
+    """fusiond connects, learns the system, requests the messages, again after a reboot, and answers TIMESYNC."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(DEADLINE)
         settings = configuration(tmp_path, f"tcp:127.0.0.1:{server.getsockname()[1]}")
         with running(settings):
             peer, _ = server.accept()
             peer.settimeout(DEADLINE)
-            autopilot, said = Autopilot(), []
-            voice = common.MAVLink(None)
+            autopilot, parser = Autopilot(), common.MAVLink(None)
 
             def until(kind: str, number: int, check: Callable[[common.MAVLink_message], bool]) -> list:
                 found: list[common.MAVLink_message] = []
                 while len(found) < number:
-                    said.extend(messages := voice.parse_buffer(peer.recv(4096)) or [])
+                    messages = parser.parse_buffer(peer.recv(4096)) or []
                     found += [m for m in messages if m.get_type() == kind and check(m)]
                 return found
 
@@ -142,13 +141,13 @@ def test_requests_and_answers_over_tcp(tmp_path: Path) -> None:
 def test_tcp_listener_outlives_its_peers(tmp_path: Path) -> None:
     port = free_port(socket.SOCK_STREAM)
     with running(configuration(tmp_path, f"tcpin:127.0.0.1:{port}")) as run:
-        source, autopilot = run.daemon.inputs["mavlink.fc"], Autopilot()
-        run.until(lambda: source.counts()["sessions"] == 1)
+        link, autopilot = run.daemon.inputs["mavlink.fc"], Autopilot()
+        run.until(lambda: link.counts()["sessions"] == 1)
         for expected in (1, 2, 3):
             with socket.create_connection(("127.0.0.1", port), DEADLINE) as peer:
                 peer.sendall(autopilot.imu())
-                run.until(lambda expected=expected: source.inbox.received == expected)
-        assert source.counts()["sessions"] == 1
+                run.until(lambda expected=expected: link.inbox.received == expected)
+        assert link.counts()["sessions"] == 1
 
 
 def test_serial_line_lost_and_back(tmp_path: Path) -> None:
@@ -164,19 +163,19 @@ def test_serial_line_lost_and_back(tmp_path: Path) -> None:
 
     line = plug()
     with running(configuration(tmp_path, f"{device},57600")) as run:
-        source, autopilot = run.daemon.inputs["mavlink.fc"], Autopilot()
+        link, autopilot = run.daemon.inputs["mavlink.fc"], Autopilot()
         for session in (1, 2):
-            run.until(lambda session=session: source.counts()["sessions"] == session)
-            before = source.inbox.received
+            run.until(lambda session=session: link.counts()["sessions"] == session)
+            before = link.inbox.received
             os.write(line, autopilot.imu())
-            run.until(lambda before=before: source.inbox.received == before + 1)
+            run.until(lambda before=before: link.inbox.received == before + 1)
             os.close(line)
             if session == 1:
                 line = plug()
 
 
-def test_tcp_peer_away_at_first_and_lost_later(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
-    """The link's absence holds up nothing else, and it is found again."""
+def test_tcp_peer_missing_at_first_and_lost_later(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
+    """Without the link everything else works; the link is opened as soon as it is there."""
     port = free_port(socket.SOCK_STREAM)
     with running(configuration(tmp_path, f"tcp:127.0.0.1:{port}", channel=channel)) as run:
         wheels, link = run.daemon.inputs["can.car"], run.daemon.inputs["mavlink.fc"]
@@ -219,7 +218,7 @@ def test_garbage_on_every_input(tmp_path: Path, channel: str, bus: can.BusABC) -
         assert link.counts()["sessions"] == wheels.counts()["sessions"] == 1
 
 
-def test_a_fault_in_an_adapter_takes_nothing_else_down(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
+def test_a_fault_in_an_adapter_stops_nothing_else(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
     port = free_port()
     settings = configuration(tmp_path, f"udpin:127.0.0.1:{port}", channel=channel)
     run = Running(settings)
@@ -255,8 +254,8 @@ def test_a_fault_in_the_estimator_ends_the_daemon(tmp_path: Path) -> None:
     assert raised.group_contains(ZeroDivisionError, match="in the estimator")
 
 
-def test_zenoh_away_at_first(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
-    """Its port is taken: states wait, then are dropped, counted; as soon as it is free new ones are published."""
+def test_zenoh_missing_at_first(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
+    """Its port is in use: states wait, then are dropped and counted; once it is free, new ones are published."""
     with socket.create_server(("127.0.0.1", 0)) as squatter:
         more = f'[zenoh]\nlisten = ["tcp/127.0.0.1:{squatter.getsockname()[1]}"]\n'
         settings = configuration(tmp_path, f"udpin:127.0.0.1:{free_port()}", more, channel)
@@ -272,13 +271,13 @@ def test_zenoh_away_at_first(tmp_path: Path, channel: str, bus: can.BusABC) -> N
 
 
 def test_reload(tmp_path: Path) -> None:
-    """A link's connection changes live; with a change of the filter beside it, nothing does."""
+    """A link's connection changes live; together with a change of the filter, nothing changes."""
     first, second = free_port(), free_port()
     settings = configuration(tmp_path, f"udpin:127.0.0.1:{first}")
     file = tmp_path / "live.toml"
     with running(settings, lambda: config.load(file)) as run:
-        source = run.daemon.inputs["mavlink.fc"]
-        run.until(lambda: source.counts()["sessions"] == 1)
+        link = run.daemon.inputs["mavlink.fc"]
+        run.until(lambda: link.counts()["sessions"] == 1)
         text = file.read_text().replace(str(first), str(second))
         file.write_text(text.replace("heading_deg = 30.0", "heading_deg = 40.0"))
         run.call(run.daemon.reload)
@@ -291,19 +290,19 @@ def test_reload(tmp_path: Path) -> None:
             assert run.daemon.config == settings
         file.write_text(text)
         run.call(run.daemon.reload)
-        run.until(lambda: source.counts()["sessions"] == 2)
+        run.until(lambda: link.counts()["sessions"] == 2)
         peer, send = udp(second)
         with closing(peer):
             send(Autopilot().imu())
-            run.until(lambda: source.inbox.received == 1)
+            run.until(lambda: link.inbox.received == 1)
 
 
 def replayed(settings: Config, logs: list[str]) -> list[bytes]:
-    """What a replay of recordings publishes."""
-    told: list[bytes] = []
-    wants = Wants(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])
-    Replay(settings, wants).run(open_logs(logs, settings))
-    return told
+    """The states that a replay of recordings publishes."""
+    published: list[bytes] = []
+    task = ReplayTask(settings.publish.rate_hz, on_tick=[lambda message, _: published.append(encode(message, "json"))])
+    Replay(settings, task).run(open_logs(logs, settings))
+    return published
 
 
 @pytest.mark.parametrize(("file_mb", "on_imu"), [(64.0, False), (0.01, False), (64.0, True)])

@@ -1,4 +1,4 @@
-"""The estimator's thread: it takes all that came before its end, keeps its ticks, does what it is asked between turns."""
+"""The estimator's thread: it processes everything received before its end, makes ticks, and answers calls between steps."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ import pytest
 from fusiond.app.live.estimator_thread import PREPARE_NS, STALLED_NS, Estimator
 from fusiond.app.live.live_engine import LiveEngine
 from fusiond.ports.inputs import Inbox
+from fusiond.units import MILLISECOND as MS
 from fusiond_adapters.host.clock import HostClock
 
 DEADLINE = 10.0  # s
-MS = 1_000_000
 
 
 class Live:
-    """What the estimator needs of the engine: takes two frames a step, and ticks every 20 ms once asked to."""
+    """Stands in for the engine: processes two frames a step, and ticks every 20 ms once a tick is set."""
 
     def __init__(self, clock: HostClock) -> None:
-        self.taken: list[int] = []
+        self.processed: list[int] = []
         self.threads: set[int] = set()
         self.ticks: list[int] = []  # when they were made
         self.next_tick_ns: int | None = None
@@ -34,12 +34,12 @@ class Live:
         self.before_step: Callable[[], None] = lambda: None
         self._clock, self._frames = clock, list[int]()
 
-    def step(self, sources: Mapping[str, Any], *, give_way: bool = False) -> bool:
+    def step(self, inputs: Mapping[str, Any], *, give_way: bool = False) -> bool:
         assert not self.unfinished, "the last tick was not finished"
         self.before_step()
         self.threads.add(threading.get_ident())
-        self._frames += [item for source in sources.values() for _, item in source.inbox.take()]
-        self.taken += self._frames[:2]
+        self._frames += [item for one in inputs.values() for _, item in one.inbox.take()]
+        self.processed += self._frames[:2]
         self._frames = self._frames[2:]
         if self.next_tick_ns is not None and self._clock.now_ns() >= self.next_tick_ns:
             self.ticks.append(self._clock.now_ns())
@@ -55,7 +55,7 @@ class Live:
         self.prepared.append(self.next_tick_ns - self._clock.now_ns())
 
 
-class Source:
+class FrameInput:
     def __init__(self, wake: Callable[[], None]) -> None:
         self.inbox: Inbox[int] = Inbox(1000, wake, hash)
 
@@ -63,12 +63,12 @@ class Source:
 class Rig:
     def __init__(self) -> None:
         clock, wake = HostClock(), threading.Event()
-        self.clock, self.live, self.source, self.turns = clock, Live(clock), Source(wake.set), 0
-        self.estimator = Estimator(cast(LiveEngine, self.live), {"one": cast(Any, self.source)}, clock, wake, self._count)
+        self.clock, self.live, self.input, self.steps = clock, Live(clock), FrameInput(wake.set), 0
+        self.estimator = Estimator(cast(LiveEngine, self.live), {"one": cast(Any, self.input)}, clock, wake, self._count)
         self.errors: list[BaseException] = []
 
     def _count(self) -> None:
-        self.turns += 1
+        self.steps += 1
 
     def run(self) -> None:
         try:
@@ -88,25 +88,25 @@ class Rig:
             assert not thread.is_alive()
 
 
-def test_everything_that_came_before_the_end_is_taken() -> None:
+def test_everything_received_before_the_end_is_processed() -> None:
     for _ in range(20):
         rig = Rig()
         with rig.running():
             for number in range(200):
-                rig.source.inbox.put(number, number)
-        assert rig.live.taken == list(range(200))
+                rig.input.inbox.put(number, number)
+        assert rig.live.processed == list(range(200))
 
 
 def test_it_sleeps_while_there_is_nothing_to_do_and_wakes_for_a_frame() -> None:
     rig = Rig()
     with rig.running():
         time.sleep(0.1)
-        assert rig.turns <= 2
-        rig.source.inbox.put(0, 7)
+        assert rig.steps <= 2
+        rig.input.inbox.put(0, 7)
         ends = time.monotonic() + DEADLINE
-        while not rig.live.taken and time.monotonic() < ends:
+        while not rig.live.processed and time.monotonic() < ends:
             time.sleep(0.001)
-    assert rig.live.taken == [7]
+    assert rig.live.processed == [7]
 
 
 def test_ticks_are_made_without_input() -> None:
@@ -124,7 +124,7 @@ def test_ticks_are_made_without_input() -> None:
 
 
 def test_garbage_is_collected_while_there_is_time() -> None:
-    """And not at any other time, where Python's own collections are off."""
+    """And at no other time, if Python's own collection is off."""
     rig, left = Rig(), []
 
     def collecting(phase: str, _: dict[str, int]) -> None:
@@ -152,18 +152,18 @@ def test_garbage_is_collected_while_there_is_time() -> None:
     assert min(left) > 0
 
 
-def test_what_it_is_asked_it_does_in_its_thread_and_after_its_end_here() -> None:
+def test_calls_run_in_its_thread_and_after_its_end_in_the_caller() -> None:
     rig = Rig()
     with rig.running() as thread:
         assert rig.estimator.ask(threading.get_ident).result(DEADLINE) == thread.ident
         with pytest.raises(KeyError):
             rig.estimator.ask(lambda: {}["nothing"]).result(DEADLINE)
-        assert rig.estimator.ask(lambda: 3).result(DEADLINE) == 3  # and goes on
+        assert rig.estimator.ask(lambda: 3).result(DEADLINE) == 3  # it continues
         assert rig.live.threads == {thread.ident}
     assert rig.estimator.ask(threading.get_ident).result(0) == threading.get_ident()
 
 
-def test_a_fault_of_its_own_ends_it_and_leaves_nobody_waiting() -> None:
+def test_a_fault_ends_it_and_leaves_no_caller_waiting() -> None:
     rig = Rig()
     asked, may_fail = threading.Event(), threading.Event()
 
@@ -174,7 +174,7 @@ def test_a_fault_of_its_own_ends_it_and_leaves_nobody_waiting() -> None:
 
     rig.live.before_step = fail
     with rig.running():
-        rig.source.inbox.put(0, 1)
+        rig.input.inbox.put(0, 1)
         assert asked.wait(DEADLINE)
         answer = rig.estimator.ask(lambda: 5)
         may_fail.set()
@@ -182,7 +182,7 @@ def test_a_fault_of_its_own_ends_it_and_leaves_nobody_waiting() -> None:
     assert len(rig.errors) == 1
 
 
-def test_it_is_alive_as_long_as_it_comes_round() -> None:
+def test_it_is_alive_while_it_finishes_steps() -> None:
     rig, entered, may_go = Rig(), threading.Event(), threading.Event()
 
     def hang() -> None:
@@ -191,16 +191,16 @@ def test_it_is_alive_as_long_as_it_comes_round() -> None:
 
     assert not rig.estimator.is_alive()
     with rig.running():
-        rig.source.inbox.put(0, 1)
+        rig.input.inbox.put(0, 1)
         ends = time.monotonic() + DEADLINE
         while not rig.estimator.is_alive() and time.monotonic() < ends:
             time.sleep(0.001)
         assert rig.estimator.is_alive()
         rig.live.before_step = hang
-        rig.source.inbox.put(0, 2)
+        rig.input.inbox.put(0, 2)
         assert entered.wait(DEADLINE)
-        rig.estimator._beat_ns -= STALLED_NS  # as if that had lasted
+        rig.estimator._step_ns -= STALLED_NS  # as if that had lasted
         assert not rig.estimator.is_alive()
         may_go.set()
     assert rig.estimator.is_alive()
-    assert rig.live.taken == [1, 2]
+    assert rig.live.processed == [1, 2]

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import common
 from fusiond.__main__ import SUCCESS, UNUSABLE, main
 from fusiond.app.client import Client, ClientError
 from fusiond.app.replay.attached import attachable
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.summary import Summary
 from fusiond.config import load as config
 from fusiond.config.outputs import Zenoh
@@ -68,7 +68,7 @@ def replayed(file: Path) -> list[Message]:
     sent: list[Message] = []
     settings = config.load(file)
     logs = open_logs([str(folder() / log) for log in LOGS], settings)
-    Replay(settings, Wants(settings.publish.rate_hz, on_message=[sent.append])).run(logs)
+    Replay(settings, ReplayTask(settings.publish.rate_hz, on_message=[sent.append])).run(logs)
     return sent
 
 

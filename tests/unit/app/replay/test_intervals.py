@@ -20,10 +20,10 @@ def setup() -> Config:
     [
         ("gps9:1-2", "there is no source 'gps9'; configured: gps0, front_left"),
         ("gps0", "give SOURCE:START-STOP"),
-        ("gps0:", "is no interval"),
-        ("gps0:5-5", "is no interval"),
-        ("gps0:9-5", "is no interval"),
-        ("gps0:-1-5", "is no interval"),
+        ("gps0:", "is not an interval"),
+        ("gps0:5-5", "is not an interval"),
+        ("gps0:9-5", "is not an interval"),
+        ("gps0:-1-5", "is not an interval"),
         (":1-2", "there is no source ''"),
     ],
 )

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from fusiond.app.replay.comparison import Errors, Truth, TruthRow, Window
+from fusiond.app.replay.comparison import Errors, Window
 from fusiond.app.replay.intervals import Withheld, parse_withheld
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
+from fusiond.app.replay.truth import Truth, TruthSample
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
@@ -65,7 +66,7 @@ def ticks_of(setup: Config, events: list[Received], rate_hz: float = RATE) -> tu
     def note(message: StateMessage, _: Errors | None) -> None:
         instants.append(message.t_ns - events[0].t_receive_ns)
 
-    replay = Replay(setup, Wants(rate_hz, on_tick=[note]))
+    replay = Replay(setup, ReplayTask(rate_hz, on_tick=[note]))
     replay.run(events)
     return replay, instants
 
@@ -89,7 +90,7 @@ def test_a_tick_comes_after_all_it_may_know_and_before_the_rest(setup: Config, e
     def receipt(receipt: Receipt) -> None:
         order.append(("event", receipt.measurement.t_receive_ns))
 
-    Replay(setup, Wants(RATE, on_tick=[tick], on_receipt=[receipt])).run(events)
+    Replay(setup, ReplayTask(RATE, on_tick=[tick], on_receipt=[receipt])).run(events)
     assert {kind for kind, _ in order} == {"tick", "event"}
     for (kind, t_ns), (next_kind, next_ns) in pairwise(order):
         if kind == "tick":
@@ -140,7 +141,7 @@ def test_a_tick_that_waited_tells_of_the_sample_that_it_waited_for(setup: Config
         def tick(message: StateMessage, _: Errors | None, found: list[float] = found) -> None:
             found.append(message.age_ms or 0.0)
 
-        Replay(settings, Wants(RATE, on_tick=[tick])).run(events)
+        Replay(settings, ReplayTask(RATE, on_tick=[tick])).run(events)
         ages[settings.publish.on_imu] = found[:-4]  # at the end there are only late fixes
     assert max(ages[True]) < 2.5 < statistics.median(ages[False])
 
@@ -151,7 +152,7 @@ def test_ticks_tell_what_a_live_fusion_would(setup: Config, events: list[Receive
     def tick(message: StateMessage, _: Errors | None) -> None:
         told[message.t_ns] = csv_row(message)
 
-    Replay(setup, Wants(RATE, on_tick=[tick])).run(events)
+    Replay(setup, ReplayTask(RATE, on_tick=[tick])).run(events)
     checked = list(told)[1::40]
     live = Fusion(setup)
     waiting = iter(events)
@@ -187,7 +188,7 @@ def test_ticks_stop_in_a_hole_and_go_on_upon_the_grid(setup: Config) -> None:
 
 
 def test_without_a_taker_there_are_no_ticks(setup: Config, events: list[Received]) -> None:
-    replay = Replay(setup, Wants(RATE))
+    replay = Replay(setup, ReplayTask(RATE))
     replay.run(events)
     summary = replay.summary("c.toml", {}, [])
     assert summary.published is None
@@ -197,7 +198,7 @@ def test_without_a_taker_there_are_no_ticks(setup: Config, events: list[Received
 
 def test_pace_is_asked_before_every_event_and_tick(setup: Config) -> None:
     asked: list[int] = []
-    replay = Replay(setup, Wants(10.0, pace=asked.append, on_tick=[lambda *_: None]))
+    replay = Replay(setup, ReplayTask(10.0, pace=asked.append, on_tick=[lambda *_: None]))
     replay.run([imu(T0), imu(T0 + 250 * MS, 1)])
     assert asked == [0, 0, 100 * MS, 200 * MS, 250 * MS]
 
@@ -209,7 +210,7 @@ def test_withheld_events_never_arrive_but_are_counted(setup: Config, events: lis
     out = parse_withheld("gps0:2-4", setup)
     assert out == Withheld(frozenset({"gps0.position", "gps0.velocity"}), 2 * SECOND, 4 * SECOND)
     seen: list[Receipt] = []
-    replay = Replay(setup, Wants(RATE, [out], on_receipt=[seen.append]))
+    replay = Replay(setup, ReplayTask(RATE, [out], on_receipt=[seen.append]))
     replay.run(events)
     first = events[0].t_receive_ns
     fixes = [event for event in events if event.source == "gps0.position"]
@@ -223,8 +224,8 @@ def test_withheld_events_never_arrive_but_are_counted(setup: Config, events: lis
 
 def test_the_ends_of_a_withheld_interval(setup: Config) -> None:
     seen: list[Receipt] = []
-    wants = Wants(RATE, [parse_withheld("imu0:0.1-0.2", setup)], on_receipt=[seen.append])
-    Replay(setup, wants).run([imu(T0 + t * MS, t) for t in (0, 99, 100, 199, 200)])
+    task = ReplayTask(RATE, [parse_withheld("imu0:0.1-0.2", setup)], on_receipt=[seen.append])
+    Replay(setup, task).run([imu(T0 + t * MS, t) for t in (0, 99, 100, 199, 200)])
     assert [receipt.measurement.sequence for receipt in seen] == [0, 99, 200]
 
 
@@ -232,7 +233,7 @@ def test_the_ends_of_a_withheld_interval(setup: Config) -> None:
 
 
 def test_summary_accounts_for_every_event(setup: Config, events: list[Received]) -> None:
-    replay = Replay(setup, Wants(RATE))
+    replay = Replay(setup, ReplayTask(RATE))
     replay.run([*events, Received("imu0", 10**6, "", None, events[-1].t_receive_ns, Invalid("broken"))])
     summary = replay.summary("c.toml", {"a.tlog": {"records": 1}}, ["odd"])
     assert summary.events == len(events) + 1
@@ -246,7 +247,7 @@ def test_summary_accounts_for_every_event(setup: Config, events: list[Received])
 
 
 def test_latency_counts_the_configured_delay(setup: Config) -> None:
-    replay = Replay(setup, Wants(RATE))
+    replay = Replay(setup, ReplayTask(RATE))
     replay.run([Received("rear_left", k, "", None, T0 + k * MS, WheelSpeed(1.0)) for k in range(10)])
     late = replay.summary("c.toml", {}, []).sources["rear_left"].latency_ms
     assert late is not None
@@ -255,8 +256,8 @@ def test_latency_counts_the_configured_delay(setup: Config) -> None:
 
 def test_window_limits_the_comparison(setup: Config, events: list[Received]) -> None:
     first = events[0].t_receive_ns
-    rows = [TruthRow(first + k * SECOND // 10, 48.137, 11.575, 560.0, 9.0, 0.0, 0.0) for k in range(60)]
-    replay = Replay(setup, Wants(10.0, truth=Truth(rows), window=Window(3.0, 5.0)))
+    rows = [TruthSample(first + k * SECOND // 10, 48.137, 11.575, 560.0, 9.0, 0.0, 0.0) for k in range(60)]
+    replay = Replay(setup, ReplayTask(10.0, truth=Truth(rows), window=Window(3.0, 5.0)))
     replay.run(events)
     found = replay.summary("c.toml", {}, []).truth
     assert found is not None

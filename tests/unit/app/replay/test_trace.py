@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fusiond.app.replay.replay import Replay, Wants
+from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.trace import Thinned, Trace
 from fusiond.estimator.fusion import Receipt
 from fusiond.events import GnssPosition, Received
@@ -33,8 +33,8 @@ def events() -> list[Received]:
 def test_every_fix_is_drawn_as_what_became_of_it(events: list[Received], rate_hz: float) -> None:
     trace = Trace()
     receipts: list[Receipt] = []
-    wants = Wants(rate_hz, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt, receipts.append])
-    replay = Replay(settings(), wants)
+    task = ReplayTask(rate_hz, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt, receipts.append])
+    replay = Replay(settings(), task)
     replay.run(events)
     trace.read_outcomes()
     outcomes = replay.fusion.outcomes()["gps0.position"]
@@ -49,8 +49,8 @@ def test_it_has_no_rows_run_again(events: list[Received]) -> None:
     rerun = []
     for traced in (False, True):
         trace = Trace()
-        wants = Wants(50.0, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt] if traced else [])
-        replay = Replay(settings(), wants)
+        task = ReplayTask(50.0, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt] if traced else [])
+        replay = Replay(settings(), task)
         replay.run(events)
         rerun.append(replay.fusion.history.rerun)
     assert rerun[0] == rerun[1] > 0

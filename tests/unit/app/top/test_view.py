@@ -33,7 +33,7 @@ CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 def view_of(*told: Message) -> View:
     view = View()
     for message in told:
-        view.take(message)
+        view.add(message)
     return view
 
 
@@ -85,7 +85,7 @@ def test_silence_faults_and_absent_sources_are_red() -> None:
     health = msgspec.structs.replace(health, sources=health.sources | {"rear_left": gone})
     state = msgspec.structs.replace(state, fault="height_m: not finite", state=None, mode=Mode.LOST)
     lines = screen(view_of(state, health), 7.0, 200, 100)
-    for text in ("no state for 7 s", "state withheld: height_m: not finite", "nothing comes"):
+    for text in ("no state for 7 s", "state withheld: height_m: not finite", "nothing received"):
         assert colour_of(lines, text) == "red"
 
 
