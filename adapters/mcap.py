@@ -1,8 +1,9 @@
-"""MCAP files: a writer that is crash-safe and gives the same bytes for the same messages, the live recorder, a repair.
+"""MCAP files: a crash-safe writer that gives the same bytes for the same messages, the live recorder, a repair.
 
     python -m fusiond_adapters.mcap CUT.mcap WHOLE.mcap
 
-copies the intact part of a file that was cut off (power, full disk) into a file with an index. Needs the extra `mcap`.
+copies the intact part of a file that was cut off (power failure, full disk) into a file with an index. Needs the extra
+`mcap`.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ MAX_WAITING = 4096  # messages between the estimator and the disk
 
 
 class McapFile:
-    """One file. Chunks end with each second of publish time, and go to the operating system at once: a crash costs the
-    last second. A context manager: its end writes the index. Raises OSError.
+    """One file. A chunk ends with each second of publish time and is written at once: a crash costs the last second. A
+    context manager: its end writes the index. Raises OSError.
     """
 
     def __init__(self, path: Path, config: Config) -> None:
-        self.written = 0  # records that have left for the disk
-        self.waiting = 0  # records of the chunk that is being gathered
-        self.unknown = 0  # records of topics that the file does not have; they are left out
+        self.written = 0  # records written
+        self.waiting = 0  # records of the present chunk
+        self.unknown = 0  # records of unknown topics, which are left out
         self._path, self._out = path, _Out(path)
         self._writer = Writer(self._out, chunk_size=CHUNK_BYTES)
         self._writer.start(library=LIBRARY)
@@ -79,7 +80,7 @@ class McapFile:
         self._writer.add_message(channel, record.log_ns, record.data, record.publish_ns)
 
     def flush(self) -> None:
-        """End the chunk, so that what was added survives a crash of this process."""
+        """End the chunk, so that its records survive a crash of this process."""
         if self.waiting:
             self._writer.flush()
             self._flushed()
@@ -192,20 +193,20 @@ class McapRecorder:
             raise OutputLost(f"{error.filename or self._folder}: {error.strerror}") from error
 
     def counts(self) -> dict[str, int]:
-        """Records, those lost or of a topic that the files do not have, and files."""
+        """Records written, records lost (also those of unknown topics), and files."""
         file = self._file
         written, unknown = (file.written, file.unknown) if file else (0, 0)
         return {"records": self._ended + written, "records lost": self.lost + unknown, "files": self.files}
 
     def notes(self) -> dict[str, str]:
-        """Where the files are."""
+        """The folder of the files."""
         return {"folder": str(self._folder)}
 
     def _run(self, stop: Event) -> None:
         idle_s = 0.0
         stopping = False
         while not stopping:
-            stopping = stop.is_set()  # before the last look, so that it misses nothing
+            stopping = stop.is_set()  # read before the last poll, so that no message is missed
             found = self.outbox.take(POLL_S)
             idle_s = 0.0 if found else idle_s + POLL_S
             batch = [record for message in found for record in self._converter.records(message)]
@@ -243,7 +244,7 @@ class McapRecorder:
 
 
 def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
-    """The output of a configuration with a folder for it."""
+    """The output of a configuration with a folder."""
     assert config.mcap.folder is not None
     return [McapRecorder(config, config.path(config.mcap.folder))]
 
@@ -255,11 +256,11 @@ def repair(cut: Path, whole: Path) -> tuple[int, str | None]:
     """Copy the intact part of a file into another. Returns the number of messages, and why reading stopped early, if it did.
     Raises OSError."""
     messages, ids, reason = 0, dict[int, int](), None
-    with cut.open("rb") as source, whole.open("wb") as target:
+    with cut.open("rb") as damaged, whole.open("wb") as target:
         writer = Writer(target, chunk_size=CHUNK_BYTES)
         writer.start(library=LIBRARY)
         try:
-            for record in StreamReader(source, validate_crcs=True).records:
+            for record in StreamReader(damaged, validate_crcs=True).records:
                 if isinstance(record, records.DataEnd):
                     break  # a copy of the schemas and channels follows
                 messages += isinstance(record, records.Message)

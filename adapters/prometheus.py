@@ -23,7 +23,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[prometheus] needs the extra prometheus: pip install 'fusiond[prometheus]'") from missing
 
-MAX_WAITING = 4096  # messages between the estimator and the counting
+MAX_WAITING = 4096  # messages between the estimator and the server
 RATIO_BUCKETS = (0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 2.0, 5.0, 10.0, 100.0)
 DELAY_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s
 QUANTILES = {"p50": "0.5", "p90": "0.9", "p99": "0.99", "max": "1"}
@@ -40,7 +40,7 @@ class PrometheusServer:
         self._section = config.prometheus
         self.about = f"Prometheus metrics on {self._section.host}:{self._section.port}"
         self.outbox = Outbox(MAX_WAITING, (StateMessage, HealthMessage, InnovationMessage))
-        self.url: str | None = None  # while it runs
+        self.url: str | None = None  # while the server runs
         self._registry = CollectorRegistry()
         self._latest = Latest()
         self._registry.register(self._latest)
@@ -64,7 +64,7 @@ class PrometheusServer:
         try:
             stopping = False
             while not stopping:
-                stopping = stop.is_set()  # before the last look, so that it misses nothing
+                stopping = stop.is_set()  # read before the last poll, so that no message is missed
                 for message in self.outbox.take(POLL_S):
                     self._record(message)
         finally:
@@ -78,7 +78,7 @@ class PrometheusServer:
         return {"scrapes": self._latest.scrapes}
 
     def notes(self) -> dict[str, str]:
-        """Where to scrape."""
+        """The address to scrape."""
         return {"url": self.url} if self.url else {}
 
     def _record(self, message: object) -> None:
@@ -106,7 +106,7 @@ class Latest(Collector):  # type: ignore[misc]  # Any, where the extra is missin
         self.scrapes = 0
 
     def describe(self) -> list[Any]:
-        """Nothing: the names are known only from the messages."""
+        """Nothing: the names come from the messages."""
         return []
 
     def collect(self) -> Metrics:
@@ -125,9 +125,9 @@ def _of_state(message: StateMessage) -> Metrics:
     yield _gauge("mode", "1 for the present mode", modes, ["mode"])
     if message.age_ms is not None:
         yield _gauge("imu_age_seconds", "Time less the stamp of the last IMU sample", {(): message.age_ms / 1e3})
-    yield _counter("resets", "How often the state was reset, that is: jumped", {(): message.resets})
+    yield _counter("resets", "Number of resets, that is jumps of the state", {(): message.resets})
     state = message.state
-    yield _gauge("has_state", "1 if there is a state to tell", {(): float(state is not None)})
+    yield _gauge("has_state", "1 if there is a state", {(): float(state is not None)})
     if state is None:
         return
     axes = zip("ned", state.sigma_position_ned_m, strict=True)
@@ -150,7 +150,7 @@ def _of_health(health: HealthMessage) -> Metrics:
     inputs, outputs = health.inputs.items(), health.outputs.items()
     yield _counter("input_frames", "Frames received", {(name,): one.received for name, one in inputs}, ["input"])
     yield _counter("input_dropped", "Frames dropped", {(name,): one.dropped for name, one in inputs}, ["input"])
-    yield _counter("output_messages", "Messages left for it", {(name,): one.offered for name, one in outputs}, ["output"])
+    yield _counter("output_messages", "Messages offered to it", {(name,): one.offered for name, one in outputs}, ["output"])
     yield _counter("output_dropped", "Messages dropped", {(name,): one.dropped for name, one in outputs}, ["output"])
 
 
@@ -164,9 +164,9 @@ def _of_sources(sources: Mapping[str, SourceHealth]) -> Metrics:
     for name, about, values in (
         ("present", "1 if anything was received in the last 2 s", {k: float(v.present) for k, v in sources.items()}),
         ("age_seconds", "Since its last receipt", {k: _seconds(v.age_ms) for k, v in sources.items()}),
-        ("rate_hertz", "Receipts a second, lately", {k: v.rate_hz for k, v in sources.items()}),
+        ("rate_hertz", "Receipts per second, recently", {k: v.rate_hz for k, v in sources.items()}),
         ("nis_mean", "Mean squared innovation per axis, in sigmas", {k: v.nis_mean for k, v in sources.items()}),
-        ("clock_offset_seconds", "Time line less its clock",
+        ("clock_offset_seconds", "Common time line less its clock",
          {k: _seconds(v.clock.offset_ms) for k, v in sources.items() if v.clock}),
         ("clock_jitter_seconds", "Mean of receipt less aligned stamp",
          {k: _seconds(v.clock.jitter_ms) for k, v in sources.items() if v.clock}),

@@ -1,8 +1,8 @@
 """Every input, every output and every log format, one line each.
 
-A line names a module of fusiond_adapters. It is imported only when the configuration asks for it, so nobody waits for the
-import of what is off. A module of an input or an output has a function `make`, which gives one or several adapters; that
-of a log format has `open_log`, see `logs.format`.
+A line names a module of fusiond_adapters. It is imported only when the configuration needs it, so that unused adapters cost
+no time. A module of an input or an output has a function `make`, which returns one or more adapters; that of a log format
+has `open_log`, see `logs.format`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ INPUTS: Mapping[str, str] = {  # section of the configuration: module
     "mavlink": "mavlink.link",
     "can": "can.bus",
 }
-OUTPUTS: Mapping[str, Callable[[Config], bool]] = {  # module: whether the configuration asks for it
-    "zenoh.output": lambda config: True,  # other programs of fusiond read it there
+OUTPUTS: Mapping[str, Callable[[Config], bool]] = {  # module: whether the configuration needs it
+    "zenoh.output": lambda config: True,  # fusiond's own programs read from it
     "ros2.output": lambda config: config.ros2.enabled,
     "mcap": lambda config: config.mcap.folder is not None,
     "foxglove.server": lambda config: config.foxglove.enabled,
@@ -41,7 +41,7 @@ LOG_FORMATS = (
 
 
 def _mavlink_outputs(config: Config) -> set[str | None]:
-    """Where the outputs over MAVLink send."""
+    """The links and connections of the outputs over MAVLink."""
     return {config.autopilot.link, config.ground_station.link, config.ground_station.connection}
 
 

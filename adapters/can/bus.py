@@ -1,7 +1,7 @@
 """The live input of one CAN bus: its frames decoded, its error frames counted.
 
 python-can and cantools are slow to import. Only `prepare` imports them, in the input's thread, so that after a restart
-the other inputs are fused and the state is published without waiting.
+the other inputs are fused and the state is published without delay.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ class CanBus:
         self.decoder: CanDecoder | None = None  # until it is prepared
         self.state = "active"  # of the controller, by its error frames
         self.sessions = 0
-        self._seen: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._channel = config.can[bus].log_channel or bus
         self._config, self._clock = config, clock
         self._driver: CanDriver | None = None
         self.configure(config)
 
     def configure(self, config: Config) -> None:
-        """Use interface and channel of a configuration from the next session on."""
+        """Use interface and channel of a configuration from the next session."""
         settings = self._settings = config.can[self.name]
         where = " ".join(filter(None, (settings.interface, settings.channel, settings.config_context)))
         self.about = f"CAN {self.name} ({where or 'as python-can is configured'})"
 
     def prepare(self) -> None:
-        """Load the DBC files. Raises ConfigError where they do not fit."""
+        """Load the DBC files. Raises ConfigError if they do not fit."""
         from fusiond_adapters.can.decoder import CanDecoder  # noqa: PLC0415 - see above
         from fusiond_adapters.can.driver import CanDriver  # noqa: PLC0415
 
@@ -70,34 +70,34 @@ class CanBus:
             self._driver.read(bus, stop)
 
     def decode(self, item: CanFrame, t_ns: int) -> list[Received]:
-        """The wheel speeds in a frame. An error frame has none and is counted."""
+        """The events in a frame. Error frames and remote frames have none and are counted."""
         if item.is_error:
             self._count_error(item)
             return []
         if item.is_remote:
-            self._seen["remote frames"] += 1
+            self._counts["remote frames"] += 1
             return []
         assert self.decoder is not None  # frames come only after prepare
         return self.decoder.decode(item.arbitration_id, item.is_extended, item.data, t_ns)
 
     def _count_error(self, item: CanFrame) -> None:
-        """Count an error frame; one line in the log when the controller's state changes."""
-        self._seen["error frames"] += 1
+        """Count an error frame; log a change of the controller's state."""
+        self._counts["error frames"] += 1
         classes, detail = item.arbitration_id, item.data[1] if len(item.data) > 1 else 0
         controller = detail if classes & CONTROLLER else 0
-        self._seen["controller overflow"] += bool(controller & OVERFLOW)
+        self._counts["controller overflow"] += bool(controller & OVERFLOW)
         state = self.state
         if classes & BUS_OFF:
-            self._seen["bus off"] += 1
+            self._counts["bus off"] += 1
             state = "bus-off"
         elif classes & RESTARTED:
-            self._seen["restarted"] += 1
+            self._counts["restarted"] += 1
             state = "active"
         elif controller & PASSIVE:
-            self._seen["error passive"] += 1
+            self._counts["error passive"] += 1
             state = "error-passive"
         elif controller & WARNING:
-            self._seen["error warning"] += 1
+            self._counts["error warning"] += 1
             state = "error-warning"
         elif controller & ACTIVE:
             state = "active"
@@ -118,7 +118,7 @@ class CanBus:
         """Counts of frames and of errors of the bus so far."""
         own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
         decoded = self.decoder.counts if self.decoder else {}
-        return {**own, **{name: count for name, count in self._seen.items() if count}, **decoded}
+        return {**own, **{name: count for name, count in self._counts.items() if count}, **decoded}
 
 
 def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:

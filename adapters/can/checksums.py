@@ -44,5 +44,5 @@ _KINDS: dict[str, Check] = {"toyota": _toyota, "honda": _honda, "hyundai": _hyun
 
 
 def is_right(kind: str, arbitration_id: int, data: bytes) -> bool:
-    """Does the data end with the right checksum of this kind? `kind` is one that the configuration knows."""
+    """Whether the data ends with the right checksum; `kind` is a value of the configuration."""
     return bool(data) and _KINDS[kind](arbitration_id, data)

@@ -1,10 +1,10 @@
-"""CAN in: `Received` events out of data frames, by DBC files. No I/O after construction.
+"""CAN in: from data frames to `Received` events, by DBC files. No I/O after construction.
 
-Which signal is which wheel, in which unit, and which signals vouch for it, is configuration. A frame is decoded once
-for all the sensors in it, and of its signals only those in use; frames that carry none are passed over by their id.
+The configuration says which signal is which wheel, its unit, and which signals validate it. A frame is decoded once for
+all its sensors, and only the signals in use; frames without sensors are skipped by their id.
 
-J1939 messages (by the bus's key `j1939`, or by the DBC's VFrameFormat) are known by their PGN, whatever
-the priority and the sender. Of their speeds, raw values whose top byte is above 0xFA mean an error or "not available".
+J1939 messages (by the bus's key `j1939`, or by the DBC's VFrameFormat) are identified by their PGN, for any priority and
+sender. In their speeds, raw values whose top byte is above 0xFA mean an error or "not available".
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ DBC_UNITS = {  # as DBC files write them, in lower case: as the configuration do
     "mph": "mph", "mi/h": "mph", "rad/s": "rad/s", "rads/s": "rad/s", "rad/sec": "rad/s",
     "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "rev/min": "rpm",
 }  # fmt: skip
-J1939_VALID_TOP = 0xFA  # greatest top byte of a J1939 value
+J1939_VALID_TOP = 0xFA  # largest top byte of a valid J1939 value
 PDU2 = 240  # J1939: a PDU format from here on has no destination
 PER_RADIUS = {"rad/s": 1.0, "rpm": 2 * math.pi / 60}  # times the radius in metres
 
 
 def frame_key(arbitration_id: int, is_extended: bool) -> int:
-    """One number for an id of either length."""
+    """One number for ids of both lengths."""
     return arbitration_id | EXTENDED if is_extended else arbitration_id
 
 
@@ -55,8 +55,8 @@ class CanDecoder:
     """The sensors of one [can.NAME] bus.
 
     `sequences` holds the last sequence number of every source; decoders of several logs of one vehicle share it.
-    `counts` says what became of the frames, `warnings` what is odd about the configuration. Raises ConfigError where the
-    DBC files cannot be read or lack something.
+    `counts` has the number of frames by outcome, `warnings` oddities of the configuration. Raises ConfigError if the DBC
+    files cannot be read or lack something.
     """
 
     def __init__(self, config: Config, bus: str, sequences: dict[str, int] | None = None) -> None:
@@ -84,16 +84,16 @@ class CanDecoder:
 
     @property
     def keys(self) -> frozenset[int]:
-        """The `frame_key` of every frame that carries a sensor, but for those of J1939."""
+        """The `frame_key` of every frame with a sensor, except J1939."""
         return frozenset(self._frames)
 
     @property
     def groups(self) -> frozenset[int]:
-        """The PGN of every J1939 frame that carries a sensor."""
+        """The PGN of every J1939 frame with a sensor."""
         return frozenset(self._groups)
 
     def decode(self, arbitration_id: int, is_extended: bool, data: bytes, t_receive_ns: int) -> list[Received]:
-        """The events of one data frame; none where its id is of no use."""
+        """The events of one data frame; none if it has no sensor."""
         frame = self._frames.get(frame_key(arbitration_id, is_extended))
         if frame is None and self._groups and is_extended:
             frame = self._groups.get(parameter_group(arbitration_id))
@@ -108,11 +108,11 @@ class CanDecoder:
         self.counts["decoded"] += 1
         short = len(data) < frame.size
         if frame.whole and not short and not frame.checksums:
-            return [self._event(reader.name, t_receive_ns, reader.judge(signals)) for reader in frame.readers]
-        broken = [kind for kind in frame.checksums if not is_right(kind, arbitration_id, data)]
+            return [self._event(reader.name, t_receive_ns, reader.payload(signals)) for reader in frame.readers]
+        wrong = [kind for kind in frame.checksums if not is_right(kind, arbitration_id, data)]
         events = []
         for reader in frame.readers:
-            payload = Invalid("checksum") if reader.checksum in broken else reader.read(signals, short)
+            payload = Invalid("checksum") if reader.checksum in wrong else reader.read(signals, short)
             if payload is not None:
                 events.append(self._event(reader.name, t_receive_ns, payload))
         return events
@@ -123,22 +123,22 @@ class CanDecoder:
 
 
 class Reader(Protocol):
-    """What makes the events of one sensor of decoded signals."""
+    """Makes the events of one sensor from decoded signals."""
 
     name: str
-    checksum: Checksum | None  # whose checksum the frame ends with
+    checksum: Checksum | None  # kind of checksum at the end of the frame
     needed: list[str]  # signals
-    warnings: list[str]  # what is odd about its configuration
+    warnings: list[str]  # oddities of its configuration
 
     def read(self, signals: Mapping[str, float], short: bool) -> AnyPayload | None:
-        """None where the frame, multiplexed, carries other signals this time."""
+        """The payload; None if the frame is multiplexed and has other signals this time."""
 
-    def judge(self, signals: Mapping[str, float]) -> AnyPayload:
-        """The same, where none of the needed signals is missing."""
+    def payload(self, signals: Mapping[str, float]) -> AnyPayload:
+        """The payload if none of the needed signals is missing."""
 
 
 class _Frame:
-    """One frame with sensors in it, and how the signals in use are cut out of its data."""
+    """One frame with sensors, and how to extract the signals in use from its data."""
 
     def __init__(self, message: Message, readers: Sequence[Reader]) -> None:
         self.readers = readers
@@ -147,16 +147,16 @@ class _Frame:
         names = {name for reader in readers for name in reader.needed}
         fields = [_field(signal, message.length) for signal in message.signals if signal.name in names]
         plain = [field for field in fields if field is not None]
-        self.whole = not message.is_multiplexed() and len(plain) == len(fields)  # no signal is missing but from short ones
+        self.whole = not message.is_multiplexed() and len(plain) == len(fields)  # signals are missing only in short frames
         if not self.whole:
             decode = partial(message.decode_simple, decode_choices=False, allow_truncated=True)
-            self.signals = cast("Callable[[bytes], Mapping[str, float]]", decode)  # without choices all are numbers
+            self.signals = cast("Callable[[bytes], Mapping[str, float]]", decode)  # without choices all values are numbers
         else:
-            self.signals = partial(_cut, plain, message.length)
+            self.signals = partial(_extract, plain, message.length)
 
 
 class _Field(NamedTuple):
-    """Where the bits of one integer signal lie in the frame's data followed by the same bytes backwards, as one number."""
+    """Position of one integer signal in the number made of the frame's data followed by the same bytes in reverse."""
 
     name: str
     end: int  # bits that a frame must have to hold it
@@ -168,7 +168,7 @@ class _Field(NamedTuple):
 
 
 def _field(signal: Signal, size: int) -> _Field | None:
-    """A signal of a message of `size` bytes, as cantools decodes it; None where it is no integer or leaves the frame."""
+    """A signal of a message of `size` bytes, as cantools decodes it; None if it is not an integer or exceeds the frame."""
     length, is_big = signal.length, signal.byte_order == "big_endian"
     begin = 8 * (signal.start // 8) + 7 - signal.start % 8 if is_big else signal.start  # counted from the first bit sent
     end = begin + length
@@ -182,8 +182,8 @@ def _field(signal: Signal, size: int) -> _Field | None:
     return _Field(signal.name, end, shift, (1 << length) - 1, sign, scale, offset)
 
 
-def _cut(fields: Sequence[_Field], size: int, data: bytes) -> dict[str, float]:
-    """The signals of a message of `size` bytes; those alone that a short frame has."""
+def _extract(fields: Sequence[_Field], size: int, data: bytes) -> dict[str, float]:
+    """The signals of a message of `size` bytes; of a short frame, only those that it contains."""
     bits = 8 * len(data)
     if len(data) != size:
         data = data[:size].ljust(size, b"\0")
@@ -197,7 +197,7 @@ def _cut(fields: Sequence[_Field], size: int, data: bytes) -> dict[str, float]:
 
 
 class _WheelReader:
-    """One wheel: decoded signals to WheelSpeed, or why not."""
+    """One wheel: from decoded signals to a WheelSpeed, or to the reason for none."""
 
     def __init__(self, name: str, wheel: Wheel, message: Message, j1939: bool) -> None:
         self.name = name
@@ -218,14 +218,14 @@ class _WheelReader:
         self.warnings = list(_unit_warnings(name, wheel, speeds))
 
     def read(self, signals: Mapping[str, float], short: bool) -> WheelSpeed | Invalid | None:
-        """None where the frame, multiplexed, carries other signals this time."""
+        """The speed; None if the frame is multiplexed and has other signals this time."""
         for name in self.needed:
             if name not in signals:
                 return Invalid("short frame") if short else None
-        return self.judge(signals)
+        return self.payload(signals)
 
-    def judge(self, signals: Mapping[str, float]) -> WheelSpeed | Invalid:
-        """The speed, if the signals, of which none that is needed is missing, vouch for it."""
+    def payload(self, signals: Mapping[str, float]) -> WheelSpeed | Invalid:
+        """The speed, if the other signals say that it is valid; none of the needed signals is missing."""
         wheel = self._wheel
         if wheel.counter_signal is not None:
             last, self._counter = self._counter, signals[wheel.counter_signal]
@@ -251,7 +251,7 @@ READERS: dict[type[Sensor], Callable[[str, Any, Message, bool], Reader]] = {Whee
 
 
 def _limits(speeds: list[Signal], given: int | None, j1939: bool) -> Iterator[tuple[str, int, float]]:
-    """Of signals that have values which mean "not available": name, sign, and the least value times sign that does."""
+    """For signals with values that mean "not available": name, sign, and the smallest such value times sign."""
     for place, signal in enumerate(speeds):
         raw = given if place == 0 else None
         if raw is None and j1939 and signal.length >= 8:
@@ -278,7 +278,7 @@ def _factor(wheel: Wheel) -> float:
 
 
 def _load(paths: Iterable[Path], key: str) -> dict[str, Message]:
-    """The messages of all the DBC files. Overlapping signals are tolerated: they are common, and mostly elsewhere."""
+    """The messages of all DBC files. Overlapping signals are tolerated: they are common, mostly in unused messages."""
     messages: dict[str, Message] = {}
     for path in paths:
         try:
@@ -293,7 +293,7 @@ def _load(paths: Iterable[Path], key: str) -> dict[str, Message]:
 
 
 def _find(name: str, known: Mapping[str, Item], key: str, kind: str) -> Item:
-    """The item of that name, or a ConfigError that names those there are, the nearest first."""
+    """The item of that name. Raises ConfigError with the known names, the most similar first."""
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)

@@ -1,8 +1,8 @@
 """python-can: opens a bus, and reads it into an inbox.
 
-python-can's own configuration (files, environment, `config_context`) opens the bus; [can.NAME] overrides it. Where the
-interface can filter, only error frames and frames with the ids of wheels come in. The kernel's stamp of a frame is mapped
-to the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and sets its filters,
+python-can's own configuration (files, environment, `config_context`) opens the bus; [can.NAME] overrides it. If the
+interface can filter, it passes only error frames and the frames of sensors. The kernel's stamp of a frame is converted to
+the host's time line; stamps of other clocks are not used. On socketcan python-can opens the bus and sets its filters,
 and `CanSocket` reads it, so that frames lost in the kernel's queue are counted.
 """
 
@@ -30,14 +30,14 @@ BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
 
 
 class CanDriver:
-    """Opens and reads a bus; `decoder` knows which frames are wanted."""
+    """Opens and reads a bus; `decoder` has the ids of the wanted frames."""
 
     def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: Clock) -> None:
         self._decoder, self._inbox, self._clock = decoder, inbox, clock
 
     @contextmanager
     def opened(self, settings: Can) -> Iterator[can.BusABC]:
-        """The bus, as long as it is in use. Raises InputLost where it cannot be opened, and where it is lost later."""
+        """The bus, open inside the block. Raises InputLost if it cannot be opened, or is lost later."""
         try:
             bus = self._open(settings)
         except (can.CanError, OSError, ValueError, ImportError) as error:

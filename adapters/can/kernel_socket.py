@@ -39,7 +39,7 @@ class CanFrame(NamedTuple):
 
 
 def frame_of(content: bytes) -> CanFrame | None:
-    """The frame in a struct can_frame or canfd_frame; None where it is neither."""
+    """The frame in a struct can_frame or canfd_frame; None if it is neither."""
     if len(content) not in (CLASSIC_SIZE, FD_SIZE):
         return None
     number, length, flags = HEADER.unpack_from(content)
@@ -50,8 +50,8 @@ def frame_of(content: bytes) -> CanFrame | None:
     return CanFrame(arbitration_id, is_extended, data, fd_flags, is_remote, is_error)
 
 
-def told_by(control: Control) -> tuple[int | None, int | None]:
-    """Wall clock's stamp [ns] and count of dropped frames in control messages; None where one is missing."""
+def stamp_and_drops(control: Control) -> tuple[int | None, int | None]:
+    """The wall clock's stamp [ns] and the count of dropped frames in control messages; None for a missing one."""
     stamp = dropped = None
     for level, kind, data in control:
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= TIMESPEC.size:
@@ -63,18 +63,18 @@ def told_by(control: Control) -> tuple[int | None, int | None]:
 
 
 class CanSocket:
-    """Reads a socket that something else opened and closes. Raises OSError where it is lost."""
+    """Reads a socket; its owner opens and closes it. Raises OSError if it is lost."""
 
     def __init__(self, opened: socket.socket) -> None:
         self.dropped = 0  # frames dropped by the kernel so far
-        self._last_count = 0  # the kernel's count goes round at 2^32
+        self._last_count = 0  # the kernel's count wraps at 2^32
         self._socket = opened
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, QUEUE_BYTES)
 
     def read(self, timeout_s: float) -> list[tuple[int | None, CanFrame]]:
-        """Frames with their wall clock's stamps [ns], after waiting for the first up to `timeout_s`."""
+        """Frames with the wall clock's stamps [ns], after waiting for the first up to `timeout_s`."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return []
         found: list[tuple[int | None, CanFrame]] = []
@@ -83,7 +83,7 @@ class CanSocket:
                 content, control, _, _ = self._socket.recvmsg(FD_SIZE, CONTROL_SIZE, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 break
-            stamp, count = told_by(control)
+            stamp, count = stamp_and_drops(control)
             if count is not None:
                 self.dropped += (count - self._last_count) & 0xFFFFFFFF
                 self._last_count = count

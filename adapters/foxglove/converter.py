@@ -40,7 +40,7 @@ Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
 
 class Channel(NamedTuple):
-    """A topic and the JSON Schema of its messages, as Foxglove can read it."""
+    """A topic and the JSON Schema of its messages in Foxglove's dialect."""
 
     topic: str
     schema_name: str
@@ -84,14 +84,14 @@ class Quaternion(Struct, frozen=True):
 
 
 class PoseOf(Struct, frozen=True):
-    """Place and attitude."""
+    """Position and attitude."""
 
     position: Vector3
     orientation: Quaternion
 
 
 class LocationFix(Struct, frozen=True):
-    """A place on the earth, on the map."""
+    """A position on the map."""
 
     timestamp: Time
     frame_id: str
@@ -113,7 +113,7 @@ class PoseInFrame(Struct, frozen=True):
 
 
 class FrameTransform(Struct, frozen=True):
-    """Where the child frame lies in the parent frame."""
+    """The child frame's position and attitude in the parent frame."""
 
     timestamp: Time
     parent_frame_id: str
@@ -142,17 +142,17 @@ TOPICS: dict[type[Message], str] = {
     for name, kind in MESSAGES.items()
     if kind in (StateMessage, SettledMessage, HealthMessage, InnovationMessage, EventMessage)
 }
-SHOWN = tuple(TOPICS)  # what an outbox lets in
+SHOWN = tuple(TOPICS)  # the kinds of messages that an outbox needs
 
 _encode = msgspec.json.Encoder().encode
 
 
 def innovations_topic(source: str) -> str:
-    """The topic of a source's innovations; a dot would have to be quoted in Foxglove's message paths."""
+    """The topic of a source's innovations. A slash replaces the dot, which would need quotes in message paths."""
     return f"{TOPICS[InnovationMessage]}/{source.replace('.', '/')}"
 
 
-def judged(config: Config) -> list[str]:
+def judged_sources(config: Config) -> list[str]:
     """The sources that have innovations: all but the IMU."""
     return [name for name, source in sorted(config.streams().items()) if source.stream.model != INERTIAL]
 
@@ -163,7 +163,7 @@ def channels(config: Config) -> list[Channel]:
         Channel(topic, name := f"foxglove.{kind.__name__}", readable_schema(kind, name)) for topic, kind in FOXGLOVE.items()
     ]
     for kind, topic in TOPICS.items():
-        topics = [innovations_topic(source) for source in judged(config)] if kind is InnovationMessage else [topic]
+        topics = [innovations_topic(source) for source in judged_sources(config)] if kind is InnovationMessage else [topic]
         name = f"fusiond.{kind.__name__}"
         schema = readable_schema(kind, name, config.sources())
         found += [Channel(topic, name, schema) for topic in topics]
@@ -171,8 +171,8 @@ def channels(config: Config) -> list[Channel]:
 
 
 def readable_schema(kind: type[Struct], title: str, sources: Iterable[str] = ()) -> bytes:
-    """The JSON Schema of a type as Foxglove reads it: an object at the top, nothing by reference, one type for each field
-    (any may be null), arrays of one kind of item, and the fields of `sources` by name."""
+    """The JSON Schema of a type for Foxglove: an object at the top, no references, one type for each field (any may be
+    null), arrays of one kind of item, and the fields of `sources` by name."""
     whole = msgspec.json.schema(kind)
     definitions = whole.pop("$defs")
 
@@ -211,14 +211,14 @@ class _Origin(NamedTuple):
 
 
 class Converter:
-    """Published messages to records for Foxglove. States are thinned to `rate_hz`, but a change of mode or a reset is always
-    shown; None: all states."""
+    """Published messages to records for Foxglove. States are thinned to `rate_hz` (None: not thinned), but a change of mode
+    or a reset is always shown."""
 
     def __init__(self, rate_hz: float | None = None) -> None:
         self._period_ns = SECOND / rate_hz if rate_hz else 1.0
-        self._turns: dict[type[Message], tuple[object, ...]] = {}  # by kind: mode and resets, whose change makes a state due
+        self._turns: dict[type[Message], tuple[object, ...]] = {}  # by kind: mode, resets and number of the last period
         self._origin: _Origin | None = None
-        self._origin_told: int | None = None  # second in which it was last
+        self._origin_second: int | None = None  # in which the origin was last published
         self._tick_ns: int | None = None  # the latest
 
     def records(self, message: Message) -> Iterator[Record]:
@@ -226,7 +226,7 @@ class Converter:
         if not isinstance(message, StateAtInstant | HealthMessage | InnovationMessage | EventMessage):
             return
         if isinstance(message, StateMessage):
-            self._tick_ns = message.t_ns  # of a tick it comes first
+            self._tick_ns = message.t_ns  # the first message of a tick
         if isinstance(message, StateAtInstant) and not self._is_due(message):
             return
         log_ns, publish_ns = message.t_ns, self._tick_ns or message.t_ns
@@ -248,16 +248,16 @@ class Converter:
         time = _time(t_ns)
         if self._origin is None:
             self._origin = _Origin(LocalFrame.at(state, ENU_FLU), state)
-        frame, place = self._origin.frame, self._origin.state
-        if self._origin_told != time.sec:  # once a second, for clients that connect later
-            self._origin_told = time.sec
-            fix = _fix(time, ROOT, place, frame)
+        frame, origin = self._origin.frame, self._origin.state
+        if self._origin_second != time.sec:  # once a second, for clients that connect later
+            self._origin_second = time.sec
+            fix = _fix(time, ROOT, origin, frame)
             yield ORIGIN, msgspec.structs.replace(fix, heading=0.0, velocity=Vector3(0.0, 0.0, 0.0))
         local = frame.state(state)
         w, x, y, z = local.quaternion_lb
-        where, turned = Vector3(*local.position_l), Quaternion(x, y, z, w)
-        yield TRANSFORM, FrameTransform(time, ROOT, BODY, where, turned)
-        yield POSE, PoseInFrame(time, ROOT, PoseOf(where, turned))
+        position, attitude = Vector3(*local.position_l), Quaternion(x, y, z, w)
+        yield TRANSFORM, FrameTransform(time, ROOT, BODY, position, attitude)
+        yield POSE, PoseInFrame(time, ROOT, PoseOf(position, attitude))
         yield LOCATION, _fix(time, BODY, state, frame)
 
 

@@ -11,7 +11,17 @@ from fusiond.config.load import load
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.messages.types import HealthMessage, StateMessage
-from fusiond_adapters.foxglove.converter import BODY, LOCATION, LOG, ORIGIN, POSE, ROOT, TOPICS, innovations_topic, judged
+from fusiond_adapters.foxglove.converter import (
+    BODY,
+    LOCATION,
+    LOG,
+    ORIGIN,
+    POSE,
+    ROOT,
+    TOPICS,
+    innovations_topic,
+    judged_sources,
+)
 
 STATE = TOPICS[StateMessage]
 AXES = ("north", "east", "down")
@@ -28,7 +38,7 @@ def layout(config: Config) -> Panel:
         "Plot!speed": _plot("Speed [m/s]", [(f"{STATE}.state.velocity_ned_mps[{i}]", name) for i, name in enumerate(AXES)]),
         "Plot!sigmas": _plot("Sigmas", _sigmas()),
         "Plot!ratios": _plot("Test ratios: 1 is the gate", [
-            (f"{innovations_topic(source)}.test_ratio", source) for source in judged(config)
+            (f"{innovations_topic(source)}.test_ratio", source) for source in judged_sources(config)
         ]),
         "RosOut!events": {"searchTerms": [], "minLogLevel": 1, "topicToRender": LOG},
         "RawMessages!health": {"topicPath": TOPICS[HealthMessage], "diffEnabled": False},

@@ -18,7 +18,7 @@ try:
 except ModuleNotFoundError as missing:
     raise ConfigError("[foxglove] needs the extra foxglove: pip install 'fusiond[foxglove]'") from missing
 
-MAX_WAITING = 1024  # messages between the estimator and the server, and as many again to each client
+MAX_WAITING = 1024  # messages between the estimator and the server, and between the server and each client
 
 
 class FoxgloveServer:
@@ -29,9 +29,9 @@ class FoxgloveServer:
     def __init__(self, config: Config) -> None:
         self.about = f"Foxglove server on {config.foxglove.host}:{config.foxglove.port}"
         self.outbox = Outbox(MAX_WAITING, SHOWN)
-        self.shown = 0  # records given to the server
-        self.unknown = 0  # records of topics that it does not have; they are left out
-        self.url: str | None = None  # while it runs
+        self.sent = 0  # records given to the server
+        self.unknown = 0  # records of unknown topics, which are left out
+        self.url: str | None = None  # while the server runs
         self._config = config
         self._converter = Converter(config.foxglove.rate_hz)
 
@@ -46,7 +46,7 @@ class FoxgloveServer:
                 context=context,
                 message_backlog_size=MAX_WAITING,
             )
-        except RuntimeError as error:  # all that the SDK raises
+        except RuntimeError as error:  # the SDK raises no other
             raise OutputLost(f"{self.about}: {error}") from error
         try:
             self.url = f"ws://{section.host}:{server.port}"
@@ -56,11 +56,11 @@ class FoxgloveServer:
             server.stop()
 
     def counts(self) -> dict[str, int]:
-        """Records shown, and those of topics that it does not have."""
-        return {"records": self.shown, "unknown topics": self.unknown}
+        """Records sent, and records of unknown topics."""
+        return {"records": self.sent, "unknown topics": self.unknown}
 
     def notes(self) -> dict[str, str]:
-        """Where to connect to."""
+        """The address to connect to."""
         return {"url": self.url} if self.url else {}
 
     def _serve(self, context: Context, stop: Event) -> None:
@@ -75,7 +75,7 @@ class FoxgloveServer:
         }
         stopping = False
         while not stopping:
-            stopping = stop.is_set()  # before the last look, so that it misses nothing
+            stopping = stop.is_set()  # read before the last poll, so that no message is missed
             for message in self.outbox.take(POLL_S):
                 for record in self._converter.records(message):
                     topic = topics.get(record.topic)
@@ -83,7 +83,7 @@ class FoxgloveServer:
                         self.unknown += 1
                         continue
                     topic.log(record.data, log_time=record.log_ns)
-                    self.shown += 1
+                    self.sent += 1
         for one in topics.values():
             one.close()
 

@@ -1,1 +1,1 @@
-"""The host: its clock, its journal, its service manager."""
+"""The host: its clock, its journal, its service manager, and folders of bounded size."""

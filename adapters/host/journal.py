@@ -1,6 +1,6 @@
 """Logging: under systemd in the journal's own protocol, with fields; otherwise as lines on stderr.
 
-A record's `extra` gives fields: FUSIOND_SOURCE (the input or output that it is about), FUSIOND_MODE, MESSAGE_ID (the
+A record's `extra` gives fields: FUSIOND_SOURCE (the source, input or output concerned), FUSIOND_MODE, MESSAGE_ID (the
 kind of event, for `journalctl MESSAGE_ID=...`). Repeats are counted instead of logged; the next record after REPEAT_S gives
 their number.
 """
@@ -43,12 +43,12 @@ def about(kind: str, subject: str) -> dict[str, str]:
 
 
 class Repeats(logging.Filter):
-    """Lets the first of equal records pass and counts those within REPEAT_S after it; the next one gives their number."""
+    """Passes the first of equal records and counts those within REPEAT_S after it; the next one gives their number."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._now = now
-        self._said: dict[tuple[int, str], tuple[float, int]] = {}  # by level and text: when it was logged, repeats since
+        self._logged: dict[tuple[int, str], tuple[float, int]] = {}  # by level and text: when it was logged, repeats since
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to log it. An event below warning always is: it reports a change."""
@@ -56,16 +56,16 @@ class Repeats(logging.Filter):
             return True
         key = record.levelno, record.getMessage()
         now = self._now()
-        said, count = self._said.get(key, (None, 0))
-        if said is not None and now - said < REPEAT_S:
-            self._said[key] = said, count + 1
+        last, count = self._logged.get(key, (None, 0))
+        if last is not None and now - last < REPEAT_S:
+            self._logged[key] = last, count + 1
             return False
-        self._said.pop(key, None)
-        self._said[key] = now, 0
-        if len(self._said) > MAX_KEPT:
-            del self._said[next(iter(self._said))]
-        if said is not None and count:
-            record.msg, record.args = f"{key[1]} ({count} times more in the {now - said:.0f} s before)", ()
+        self._logged.pop(key, None)
+        self._logged[key] = now, 0
+        if len(self._logged) > MAX_KEPT:
+            del self._logged[next(iter(self._logged))]
+        if last is not None and count:
+            record.msg, record.args = f"{key[1]} ({count} more times in the last {now - last:.0f} s)", ()
         return True
 
 
@@ -128,7 +128,7 @@ def is_journal(stream: TextIO) -> bool:
 
 
 def set_up(level: int = logging.INFO) -> None:
-    """Send all that is logged to the journal, where stderr goes there, else to stderr."""
+    """Log to the journal if stderr goes there, otherwise to stderr."""
     handler: logging.Handler = JournalHandler() if is_journal(sys.stderr) else logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
     handler.addFilter(Repeats())

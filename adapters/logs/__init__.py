@@ -1,1 +1,1 @@
-"""Recorded logs: a reader for each format, the merge of several, the black box, and drives written and played."""
+"""Recorded logs: readers for each format, merging, the black box, writing and playing drives."""

@@ -1,8 +1,8 @@
 """The black box: records everything received, in native formats, in a folder of bounded size.
 
 A file is named by the instant of its first frame, then `LINK.tlog`, `can.log`, or `state.json` for the stored state that
-the run began with. The caller never waits: a thread writes the frames. When the disk is full or slow, only the black box
-loses frames: it counts them, and starts a new file as soon as it can.
+the run started with. The caller never waits: a thread writes the frames. If the disk is full or slow, only the black box
+loses frames: it counts them, and starts a new file as soon as possible.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ NAME = name_pattern(r"\w+\.(tlog|log|json)")  # nothing else in the folder is ev
 
 
 class Recorder:
-    """Writes into a folder, made if need be. A context manager: its end writes what is waiting.
+    """Writes into a folder, created if missing. A context manager: its end writes the waiting records.
 
-    Raises OSError where the folder cannot be made.
+    Raises OSError if the folder cannot be created.
     """
 
     def __init__(self, folder: Path, file_mb: float, total_mb: float) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.written = self.lost = 0  # records
-        self.error: str | None = None  # the last one, while it lasts
+        self.error: str | None = None  # the last one, until a write succeeds
         self._folder = folder
         self._file_bytes, self._total_bytes = int(file_mb * MEGABYTE), int(total_mb * MEGABYTE)
         self._files: dict[str, tuple[BinaryIO, int]] = {}  # by kind: the open file, and its size
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         self._changed = Condition()
         self._ending = False
-        self._next_try_ns = 0  # records stamped earlier are passed over
+        self._next_try_ns = 0  # records stamped earlier are lost
         self._last_ns = 0  # stamp of the last record given to a file
         self._thread = Thread(target=self._run, name="record")
         self._thread.start()
@@ -50,7 +50,7 @@ class Recorder:
             self._waiting.append((kind, t_ns, record))
 
     def close(self) -> None:
-        """Write what is waiting, and end."""
+        """Write the waiting records, and end."""
         with self._changed:
             self._ending = True
             self._changed.notify()
@@ -107,7 +107,7 @@ class Recorder:
         for file, _ in self._files.values():
             try:
                 file.close()
-            except OSError as error:  # what was buffered is lost
+            except OSError as error:  # buffered records are lost
                 self.error = error.strerror or str(error)
         self._files.clear()
 

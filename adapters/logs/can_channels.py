@@ -1,10 +1,10 @@
 """CAN logs of any format: which frames are wanted, and which bus each channel of the log is.
 
-A bus takes the frames of its `log_channel`, by default of its own name, as the log writes it: .asc and .blf number their
-channels from 0, .trc from 1. If only one bus may be in the log, and its first wheel frames are all on another channel,
-that channel is the bus: so a log of one bus needs no configuration, and a warning says which channel was taken. A given
-`log_channel` forbids that, unless the bus is named with the log (`BUS=path`) or the format has no channels. Frames on
-other channels are counted; if all of the first wheel frames are, that is an error.
+A bus gets the frames of its `log_channel`, by default its own name, as written in the log: .asc and .blf number their
+channels from 0, .trc from 1. If only one bus can be in the log and its first wheel frames are all on another channel, that
+channel is used: so a log of one bus needs no configuration, and a warning names the channel. A given `log_channel` prevents
+that, unless the bus is named with the log (`BUS=path`) or the format has no channels. Frames on other channels are counted;
+if all of the first wheel frames are on other channels, that is an error.
 
 Counts: `frames` (all readable ones), `other ids`, `other channels`, `error frames`, `remote frames`, `bad lines`,
 `unreadable tail` (the rest of a damaged binary log), `bad stamps` (wheel frames dropped for their stamp).
@@ -29,6 +29,8 @@ DECISION = 100  # wheel frames from which the channels are chosen
 
 
 class LogFrame(NamedTuple):
+    """A data frame of a log."""
+
     t_ns: int
     channel: str | None
     arbitration_id: int
@@ -37,7 +39,7 @@ class LogFrame(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """Which frames carry a wheel."""
+    """The ids of the frames with a sensor."""
 
     keys: frozenset[int]  # see `frame_key`
     groups: frozenset[int]  # J1939's PGNs
@@ -51,7 +53,7 @@ class Wanted(NamedTuple):
         """Regular expressions of the ids as candump writes them."""
         for key in self.keys:
             yield b"%03X" % key if key <= 0x7FF else b"%08X" % (key & ID_BITS)
-        for group in self.groups:  # any priority, above the group's top bits; any destination, where it has one; any sender
+        for group in self.groups:  # any priority, any sender, and any destination if it has one
             heads = b"|".join(b"%02X" % (priority << 2 | group >> 16) for priority in range(8))
             rest = b"%04X[0-9A-F]{2}" % (group & 0xFFFF)
             if group >> 8 & 0xFF < PDU2:
@@ -64,8 +66,8 @@ FrameReader = Callable[[LogFile, Wanted], Iterator[LogFrame]]
 
 
 def open_can_log(opening: Opening, read: FrameReader) -> Reading:
-    """The reading of a CAN log, of which `read` gives the frames. Raises LogError where no bus is configured, or not that
-    one; ConfigError where the configuration does not fit its DBC files."""
+    """The reading of a CAN log; `read` returns its frames. Raises LogError if no bus is configured, or not that one;
+    ConfigError if the configuration does not fit its DBC files."""
     file, name, config = opening.file, opening.name, opening.config
     if not config.can:
         raise LogError(f"{file.path}: the configuration has no [can.NAME] for it")
@@ -77,8 +79,8 @@ def open_can_log(opening: Opening, read: FrameReader) -> Reading:
 
 
 def _events(opening: Opening, read: FrameReader, decoders: Mapping[str, CanDecoder]) -> Iterator[list[Received]]:
-    """The wheel speeds in a CAN log, frame by frame in the order of the file. Raises LogError where nothing in the file is
-    a CAN frame, or its channels fit no bus."""
+    """The events of a CAN log, frame by frame in the order of the file. Raises LogError if the file has no CAN frame, or its
+    channels fit no bus."""
     file = opening.file
     keys, groups = zip(*((decoder.keys, decoder.groups) for decoder in decoders.values()), strict=True)
     frames = _without_strays(read(file, Wanted(frozenset().union(*keys), frozenset().union(*groups))), file)
@@ -96,8 +98,8 @@ def _events(opening: Opening, read: FrameReader, decoders: Mapping[str, CanDecod
 
 
 def _without_strays(frames: Iterator[LogFrame], log: LogFile) -> Iterator[LogFrame]:
-    """The frames without those whose stamp alone jumps away and back: a damaged digit, which would delay everything after
-    it. Where the next stamps follow a jump, the clock was set."""
+    """The frames without those whose stamp alone jumps and returns: a damaged digit would delay everything after it. If the
+    next stamps follow a jump, the clock was set."""
     last_ns: int | None = None
     held: LogFrame | None = None
     for frame in frames:
@@ -130,10 +132,10 @@ def _decoders_by_channel(
         if channel is None:
             return {None: decoder}
         if named or config.can[decoder.bus].log_channel is None:
-            log.warnings.append(f"{log.path}: channel {channel} is taken for the bus {decoder.bus}")
+            log.warnings.append(f"{log.path}: channel {channel} is used as the bus {decoder.bus}")
             return {channel: decoder}
     if None in channels:
-        raise LogError(f"{log.path}: its format has no channels; say whose it is: BUS={log.path}")
+        raise LogError(f"{log.path}: its format has no channels; name the bus: BUS={log.path}")
     listed = ", ".join(sorted(str(channel) for channel in channels))
     wanted = ", ".join(str(channel) for channel in buses)
     raise LogError(f"{log.path}: wheel frames are on {listed}, wanted on {wanted}: set log_channel in [can.BUS]")

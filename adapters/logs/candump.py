@@ -1,4 +1,4 @@
-"""Reader of `candump -L` logs. An hour has tens of millions of lines, so it passes over the unwanted ones in stretches."""
+"""Reader of `candump -L` logs. An hour has tens of millions of lines, so unwanted ones are skipped many at a time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OTHERS = (  # lines as candump itself writes them, of data frames whose ids are 
     rb"((?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%(ids)b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*+\n)*+)"
 )
 WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*+)\n)?+"  # such a line with an id that is among them
-MAX_LINE = 1 << 16  # bytes; more without a line's end is no text
+MAX_LINE = 1 << 16  # bytes; a longer line is not text
 ERROR_FLAG = 0x20000000  # in the 8-digit ids of candump
 
 
@@ -29,8 +29,7 @@ def open_log(opening: Opening) -> Reading:
 
 
 def _candump(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
-    """The frames of a `candump -L` log whose ids are wanted. Most lines have other ids; one step
-    skips a stretch of them."""
+    """The frames of a `candump -L` log whose ids are wanted. Most lines have other ids; one step skips many of them."""
     ids = b"|".join(wanted.patterns()) or b"-"  # no id begins with a dash
     scan = re.compile((OTHERS + WANTED) % {b"ids": ids}).match
     counts = log.counts
@@ -38,10 +37,10 @@ def _candump(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
         at = 0
         while at < len(text):
             found = scan(text, at)
-            assert found is not None, "it may be empty"
-            passed = text.count(b"\n", at, found.end(1))
-            counts["frames"] += passed
-            counts["other ids"] += passed
+            assert found is not None, "the pattern matches the empty text"
+            skipped = text.count(b"\n", at, found.end(1))
+            counts["frames"] += skipped
+            counts["other ids"] += skipped
             at = found.end()
             seconds, micros, channel, digits, content = found.group(2, 3, 4, 5, 6)
             if digits is not None:
@@ -57,7 +56,7 @@ def _candump(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
 
 
 def _frame(line: bytes, wanted: Wanted, counts: Counter[str]) -> LogFrame | None:
-    """The frame in a line, if its id is wanted. Everything is counted."""
+    """The frame in a line, if its id is wanted. Every line is counted."""
     found = LINE.fullmatch(line)
     if found is None:
         counts["bad lines"] += bool(line.strip())
@@ -83,7 +82,7 @@ def _frame(line: bytes, wanted: Wanted, counts: Counter[str]) -> LogFrame | None
 
 
 def _whole_lines(log: LogFile) -> Iterator[bytes]:
-    """A text log in pieces that end where a line ends, in bounded memory."""
+    """A text log in pieces of whole lines, in bounded memory."""
     rest = b""
     for block in log.blocks():
         head, end, tail = block.rpartition(b"\n")

@@ -1,4 +1,4 @@
-"""One log file: its bytes, unzipped if need be, how far reading has come, and counts of what was found."""
+"""One log file: its bytes, unzipped if necessary, the progress of reading, and counts of its content."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class LogError(UnusableError):
 
 
 class LogFile:
-    """A log on disk, unzipped where its name ends in .gz. A reader counts damage in `counts`: bad lines, a cut tail.
+    """A log on disk, unzipped if its name ends in .gz. A reader counts damage in `counts`: bad lines, a truncated tail.
 
-    Raises LogError where there is no such file, or nothing in it.
+    Raises LogError if there is no such file, or it is empty.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.counts: Counter[str] = Counter()
         self.warnings: list[str] = []
-        self.bytes_read = 0  # of the file as it lies on disk
+        self.bytes_read = 0  # of the file on disk
         try:
             self.bytes_total = self.path.stat().st_size
         except OSError as error:
@@ -56,19 +56,19 @@ class LogFile:
         return self.path.suffix.lower() == ".gz"
 
     def blocks(self) -> Iterator[bytes]:
-        """The content in blocks of bounded size. A damaged gzip stream ends where the damage begins, and is counted."""
+        """The content in blocks of bounded size. A damaged gzip stream ends at the damage, which is counted."""
         with ExitStack() as stack:
             try:
                 raw = stack.enter_context(self.path.open("rb"))
             except OSError as error:
                 raise LogError(f"{self.path}: cannot be read: {error.strerror}") from error
-            source = stack.enter_context(gzip.GzipFile(fileobj=raw)) if self.zipped else raw
-            anything = False
+            stream = stack.enter_context(gzip.GzipFile(fileobj=raw)) if self.zipped else raw
+            is_empty = True
             while True:
                 try:
-                    block = source.read1(BLOCK)  # read would lose what comes before the damage
+                    block = stream.read1(BLOCK)  # `read` would lose the bytes before the damage
                 except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-                    if not anything:
+                    if is_empty:
                         raise LogError(f"{self.path}: is not a gzip file: {error}") from error
                     self.counts["damaged gzip"] += 1
                     return
@@ -76,12 +76,12 @@ class LogFile:
                     raise LogError(f"{self.path}: cannot be read: {error.strerror}") from error
                 if not block:
                     return
-                anything = True
+                is_empty = False
                 self.bytes_read = raw.tell()
                 yield block
 
     def stream(self) -> io.BufferedReader:
-        """The same content as a file object, for readers that want one."""
+        """The content as a file object, for readers that need one."""
         return io.BufferedReader(_BlockStream(self.blocks()))
 
 

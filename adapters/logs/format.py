@@ -1,4 +1,4 @@
-"""What a format of logs is: its suffix, its name for people, and how a log of it is opened."""
+"""A log format: its suffix, its name for users, and its reader."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
 
 
 class Counting(Protocol):
-    """A decoder, as far as the merge knows it."""
+    """The part of a decoder that the merge uses."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What became of the frames so far."""
+        """Counts of frames by outcome."""
 
 
 class Opening(NamedTuple):
-    """What the opener of a log is given."""
+    """The arguments of a format's `open_log`."""
 
     file: LogFile
-    about: str  # its format, for people
-    name: str | None  # of the link or bus that the user says it is of
+    about: str  # name of the format for users
+    name: str | None  # of the link or bus that the user has given
     config: Config
-    sequences: dict[str, int]  # last sequence number by source, which the logs of one vehicle share
+    sequences: dict[str, int]  # last sequence number by source, shared by the logs of one vehicle
 
 
 class Reading(NamedTuple):
@@ -44,9 +44,9 @@ class LogFormat(NamedTuple):
     raises LogError and ConfigError."""
 
     suffix: str
-    about: str  # for people
+    about: str  # name for users
     reader: str
-    zipped: bool = True  # a .gz of it can be read too
+    zipped: bool = True  # whether a .gz of it can be read too
 
     def open(self, opening: Opening) -> Reading:
         """Import the reader and open a log with it. Raises LogError, ConfigError."""

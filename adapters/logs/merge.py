@@ -1,4 +1,4 @@
-"""Several logs of one drive as one stream of `Received`, in the order of arrival."""
+"""Several logs of one drive merged into one stream of `Received` events, in the order of receipt."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Item = TypeVar("Item")
 def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
     """Prepare the logs of one drive for reading. Only their sizes are read yet.
 
-    The suffix of a path gives the format. A .tlog belongs to the first [mavlink.NAME]; a CAN log may hold any [can.NAME],
-    told apart by channel (see `can_channels`). `LINK=path` or `BUS=path` says which it is.
-    Raises LogError for a path that cannot be a log, ConfigError for a configuration that does not fit its DBC files.
+    The suffix of a path gives the format. A .tlog belongs to the first [mavlink.NAME]; a CAN log may contain any [can.NAME],
+    distinguished by channel (see `can_channels`). `LINK=path` or `BUS=path` names the link or bus.
+    Raises LogError for a path that is not a log, ConfigError for a configuration that does not fit its DBC files.
     """
     if not paths:
         raise LogError("no log given")
@@ -38,9 +38,9 @@ def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
 class LogSet:
     """The logs of one drive; iterating, once, yields their events merged by `t_receive_ns`.
 
-    Each log keeps its own order. Where its stamps run back, an event counts as received with the latest one
-    before it: nothing is lost, and no other log is delayed. Ties go by the order in which the logs were given.
-    Iterating raises LogError where a file turns out to be no log.
+    Each log keeps its own order. If its stamps run back, an event counts as received with the latest one before it: nothing
+    is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
+    Iterating raises LogError if a file is not a log.
     """
 
     def __init__(self, logs: Sequence[_Log]) -> None:
@@ -67,14 +67,15 @@ class LogSet:
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """Counts of the content by log, without those that are 0."""
+        """Counts of the content by log, without zeros."""
         return {str(log.file.path): log.counts() for log in self._logs}
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know about the logs, complete once they are read."""
+        """Warnings about the logs, complete once they are read."""
         found = [warning for log in self._logs for warning in log.file.warnings]
-        found += [f"{log.file.path}: nothing in it that the configuration asks for" for log in self._logs if log.barren]
+        empty = [log for log in self._logs if log.is_empty]
+        found += [f"{log.file.path}: nothing in it that the configuration asks for" for log in empty]
         links = [log for log in self._logs if log.first_ns is not None and log.protocol == "mavlink"]
         buses = [log for log in self._logs if log.first_ns is not None and log.protocol == "can"]
         if links and buses and not any(link.overlaps(bus) for link in links for bus in buses):
@@ -84,8 +85,8 @@ class LogSet:
 
 
 def _ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """The same items, read READ_AHEAD at a time. Alternating long stretches of reading and fusing is faster by a sixth: code
-    and data stay in the processor's caches."""
+    """The same items, read READ_AHEAD at a time. Reading and fusing many events in turn is faster by a sixth: code and
+    data stay in the processor's caches."""
     while some := list(islice(items, READ_AHEAD)):
         yield from some
 
@@ -98,11 +99,11 @@ class _Log:
         self.protocol = reading.protocol
         self.first_ns: int | None = None
         self.last_ns = 0
-        self.barren = False  # read to its end without an event
+        self.is_empty = False  # read to its end without an event
         self._reading = reading
 
     def placed(self) -> Iterator[tuple[int, list[Received]]]:
-        """The events of each frame, with the greatest receive stamp so far."""
+        """The events of each frame, with the latest receive stamp so far."""
         latest_ns: int | None = None
         for events in self._reading.frames:
             if not events:
@@ -116,7 +117,7 @@ class _Log:
                 self.first_ns = min(self.first_ns, t_ns)
                 self.file.counts["stamps run back"] += len(events)
             yield latest_ns, events
-        self.barren = latest_ns is None
+        self.is_empty = latest_ns is None
         self.file.bytes_read = self.file.bytes_total
 
     def counts(self) -> dict[str, int]:
@@ -156,7 +157,7 @@ def _known() -> str:
 
 
 def _split(argument: str, config: Config) -> tuple[str | None, str]:
-    """`NAME=path` into its parts; a `=` that does not follow a link's or bus's name belongs to the path."""
+    """`NAME=path` into its parts; a `=` that does not follow the name of a link or bus is part of the path."""
     name, equals, path = argument.partition("=")
     known = [configured for section in INPUTS for configured in getattr(config, section)]
     if equals and name in known:

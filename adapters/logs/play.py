@@ -1,7 +1,7 @@
 """Plays a recorded drive into live inputs as the vehicle would: MAVLink frames over UDP, CAN frames by python-can.
 
-In real time the clock is the host's, and a daemon that is too slow loses frames as on a vehicle. Faster than real time,
-the player has a clock of its own, which waits whenever the daemon falls behind.
+In real time the clock is the host's, and a daemon that is too slow loses frames as on a vehicle. Faster than real time, the
+player has a clock of its own, which waits whenever the daemon falls behind.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Any
 
 import can
 
-from fusiond.units import MICROSECOND, SECOND
+from fusiond.units import MICROSECOND, MILLISECOND, SECOND
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.logs.file import LogFile
 from fusiond_adapters.mavlink.decoder import frame_length
 from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
 
 MIN_SLEEP_S = 0.0005  # no sleep is shorter: records that are due within this are sent together
-BEHIND_NS = 20_000_000  # the clock waits for a daemon that is further behind
-LOOK_S = 0.0002  # between two looks at it
+BEHIND_NS = 20 * MILLISECOND  # the clock waits for a daemon that is further behind
+POLL_S = 0.0002  # between two checks of the daemon
 PATIENCE_S = 1.0  # longest wait: the drive may have a gap
 
 
@@ -41,11 +41,11 @@ class PlayedClock(HostClock):
         return self._now_ns
 
     def from_wall_ns(self, wall_ns: int) -> int:
-        """The present instant: stamps of the wall clock mean nothing here."""
+        """The present instant: stamps of the wall clock have no meaning here."""
         return self._now_ns
 
     def set(self, t_ns: int) -> None:
-        """Go on to an instant."""
+        """Advance to an instant."""
         self._now_ns = max(self._now_ns, t_ns)
 
 
@@ -68,13 +68,13 @@ def can_records(path: Path) -> Iterator[tuple[int, can.Message]]:
 
 
 class Player:
-    """A drive to be played to a UDP port and a CAN bus. A context manager."""
+    """Plays a drive to a UDP port and a CAN bus. A context manager."""
 
     def __init__(self, mavlink: Path, canlog: Path, port: int, bus: can.BusABC) -> None:
         self.sent_mavlink = 0  # frames
         self.sent_can: dict[int, int] = {}  # frames by id
         self.since_ns = self.late_ns = 0  # how much of the drive has been played; largest delay of a record
-        self.seconds = 0.0  # it took
+        self.seconds = 0.0  # duration of the playing
         self._bus, self._port = bus, port
         records: list[tuple[int, Callable[[Any], object], Any]] = []
         records += [(t_ns, self._send_mavlink, frame) for t_ns, frame in mavlink_records(mavlink)]
@@ -83,14 +83,14 @@ class Player:
         self.begin_ns = self._records[0][0]
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def play(self, clock: HostClock, heard_ns: Callable[[], int], halt: Event) -> Iterator[int]:
-        """Send every record when it is due, until `halt` is set; yields each stamp. `heard_ns` gives the stamp up to which
-        the daemon has taken records; 0 before the first."""
+    def play(self, clock: HostClock, processed_ns: Callable[[], int], halt: Event) -> Iterator[int]:
+        """Send every record when it is due, until `halt` is set; yields each stamp. `processed_ns` returns the stamp up to
+        which the daemon has processed records; 0 before the first."""
         began = time.monotonic()
         for t_ns, send, item in self._records:
             if isinstance(clock, PlayedClock):
                 _sleep(began + (t_ns - self.begin_ns) / clock.speed / SECOND - time.monotonic())
-                _await(lambda t_ns=t_ns: not 0 < heard_ns() < t_ns - BEHIND_NS)  # type: ignore[misc]
+                _await(lambda t_ns=t_ns: not 0 < processed_ns() < t_ns - BEHIND_NS)  # type: ignore[misc]
                 clock.set(t_ns)
             else:
                 _sleep((t_ns - clock.now_ns()) / SECOND)
@@ -126,4 +126,4 @@ def _await(condition: Callable[[], bool]) -> None:
     """Wait until a condition holds, at most PATIENCE_S."""
     ends = time.monotonic() + PATIENCE_S
     while not condition() and time.monotonic() < ends:
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)

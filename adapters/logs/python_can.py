@@ -1,6 +1,6 @@
 """Readers of the CAN logs that python-can knows: .asc, .blf, .trc, .csv, .db (its SQLite), .mf4 (with the extra `mf4`).
 
-Stamps are what the log holds, absolute where it has its start.
+Stamps are those of the log, absolute if it has its start time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fusiond_adapters.logs.format import Opening, Reading
 BINARY = (".blf", ".db", ".mf4")  # the others are text
 MF4_MAGIC = (b"MDF", b"UnFinMF")
 
-# What python-can's readers are known to raise on content that is not of their format.
+# Exceptions of python-can's readers on content that is not of their format.
 DAMAGE: tuple[type[Exception], ...] = (
     ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError,
     struct.error, zlib.error, sqlite3.Error, BLFParseError,
@@ -48,7 +48,7 @@ def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
             counts["remote frames"] += 1
         else:
             try:
-                t_ns = round(message.timestamp * 1e6) * MICROSECOND  # a float of Unix time has no more digits
+                t_ns = round(message.timestamp * 1e6) * MICROSECOND  # a float of Unix time is not more accurate
             except (ValueError, OverflowError):
                 counts["bad lines"] += 1
                 continue
@@ -57,7 +57,7 @@ def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
 
 
 class _Text(io.TextIOWrapper):
-    """The text of a log, which counts the lines that were read."""
+    """The text of a log; counts the lines read."""
 
     lines = 0
 
@@ -68,8 +68,8 @@ class _Text(io.TextIOWrapper):
 
 
 def _messages(log: LogFile) -> Iterator[can.Message]:
-    """python-can's messages. After a bad line of a text format, reading goes on and loses at most one more line; a
-    binary format ends there."""
+    """python-can's messages. After a bad line of a text format, reading continues and loses at most one more line; a binary
+    format ends there."""
     text = None if log.suffix in BINARY else _Text(log.stream(), encoding="utf-8", errors="replace")
     damage = (*DAMAGE, *_mf4_damage(log)) if log.suffix == ".mf4" else DAMAGE
     try:
@@ -86,7 +86,7 @@ def _messages(log: LogFile) -> Iterator[can.Message]:
                     log.counts["unreadable tail"] += 1
                     return
                 if text.lines <= lines:
-                    return  # the end: the reader failed for lack of a header
+                    return  # the end: the reader failed because a header is missing
                 lines = text.lines
                 log.counts["bad lines"] += 1
             else:
@@ -105,12 +105,12 @@ def _open(log: LogFile, text: _Text | None) -> can.io.generic.MessageReader:
         return can.SqliteReader(log.path)
     with log.path.open("rb") as file:
         if not file.read(8).startswith(MF4_MAGIC):  # checked first: asammdf prints to standard error besides raising
-            raise ValueError("it does not begin like one")
+            raise ValueError("it does not start like one")
     return can.MF4Reader(log.path)
 
 
 def _mf4_damage(log: LogFile) -> Iterator[type[Exception]]:
-    """What asammdf and the decompressors behind it raise, besides DAMAGE. Raises LogError where it is not installed."""
+    """Exceptions of asammdf and its decompressors besides DAMAGE. Raises LogError if it is not installed."""
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{log.path}: reading .mf4 needs the extra mf4: pip install 'fusiond[mf4]'")
     yield RuntimeError

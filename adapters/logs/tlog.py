@@ -1,7 +1,7 @@
-"""Reader of .tlog: MAVLink frames, each after the microseconds of Unix time of its receipt (8 bytes, big endian).
+"""Reader of .tlog: MAVLink frames, each after the Unix time of its receipt (microseconds, 8 bytes, big endian).
 
 The file may be damaged anywhere. While one record follows another, only the magic bytes are checked, and unwanted frames
-are skipped by their headers. Where the next record is missing, the search goes on byte by byte and checksums decide. A
+are skipped by their headers. If the next record is missing, it is searched byte by byte, and checksums decide. A
 stamp that jumps is compared with its neighbours: a single outlier is dropped with its record, a clock that was set is
 followed.
 
@@ -44,8 +44,8 @@ REACH = 2 * (STAMP_SIZE + MAX_FRAME_BYTES)  # bytes in which a whole record and 
 
 
 def open_log(opening: Opening) -> Reading:
-    """The reading of a .tlog, by default of the first link. Raises LogError where no link is configured, or not that one;
-    ConfigError where the dialect lacks a wanted message."""
+    """The reading of a .tlog, by default of the first link. Raises LogError if no link is configured, or not that one;
+    ConfigError if the dialect lacks a wanted message."""
     path, links = opening.file.path, opening.config.mavlink
     if not links:
         raise LogError(f"{path}: the configuration has no [mavlink.NAME] for it")
@@ -57,14 +57,14 @@ def open_log(opening: Opening) -> Reading:
 
 
 def read_tlog(log: LogFile, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
-    """The events of a .tlog, frame by frame in the order of the file. Raises LogError where there is no MAVLink in it."""
+    """The events of a .tlog, frame by frame in the order of the file. Raises LogError if it has no MAVLink frame."""
     yield from _Records(log, decoder)
     if not log.counts["records"]:
         raise LogError(f"{log.path}: no MAVLink frame in it; is it a .tlog?")
 
 
 class _Records:
-    """Cuts a .tlog into records and has them decoded."""
+    """Cuts a .tlog into records and decodes them."""
 
     def __init__(self, log: LogFile, decoder: MavlinkDecoder) -> None:
         self._blocks = log.blocks()
@@ -72,13 +72,13 @@ class _Records:
         self._decoder, self._dialect = decoder, decoder.dialect
         self._buffer = b""
         self._ended = False
-        self._last_us: int | None = None  # stamp of the last record taken
-        self._in_step = False  # the last record ended where reading goes on
+        self._last_us: int | None = None  # stamp of the last record used
+        self._in_step = False  # the last record ended at the present position
 
     def __iter__(self) -> Iterator[list[Received]]:
         at = 0
         skipped = 0  # bytes since the last record
-        cut = False  # the bytes skipped began like a record that the file's end cuts off
+        cut = False  # the skipped bytes start like a record that is cut off by the end of the file
         counts = self._counts
         while True:
             if len(self._buffer) - at < REACH and not self._ended:
@@ -112,8 +112,8 @@ class _Records:
             counts["bad bytes"] += skipped
 
     def _plain(self, at: int) -> Generator[list[Received], None, int]:
-        """Cut the ordinary MAVLink 2 records from `at` on. Returns where the buffer ends, or where a record needs a closer
-        look."""
+        """Cut the ordinary MAVLink 2 records from `at` on. Returns the end of the buffer, or the position of a record that
+        needs more checks."""
         buffer, unpack, decode = self._buffer, RECORD_2.unpack_from, self._decoder.decode_by_header
         until, records, last_us = len(buffer) - REACH, 0, self._last_us
         while at <= until and last_us is not None:
@@ -135,7 +135,7 @@ class _Records:
         return at
 
     def _refill(self, at: int) -> int:
-        """Read on until a record and the next one's beginning are there, or the file ends. The new place of `at`."""
+        """Read until the buffer has a record and the start of the next one, or the file ends. Returns the new `at`."""
         parts = [self._buffer[at:]]
         size = len(parts[0])
         while size < REACH and not self._ended:
@@ -147,7 +147,7 @@ class _Records:
         return 0
 
     def _record_size(self, at: int) -> int:
-        """Bytes of the record that begins at `at`; 0 where none does."""
+        """Bytes of the record that begins at `at`; 0 if none does."""
         buffer, size = self._buffer, len(self._buffer)
         start = at + STAMP_SIZE
         if size < start + LENGTH_KNOWN:
@@ -172,7 +172,7 @@ class _Records:
         return abs(stamp_us - self._last_us) < RESYNC_REACH_US
 
     def _is_cut(self, at: int) -> bool:
-        """Does the file end inside the record at `at`?"""
+        """Whether the file ends inside the record at `at`."""
         start = at + STAMP_SIZE
         if not self._ended or len(self._buffer) < start + LENGTH_KNOWN:
             return self._ended
@@ -180,7 +180,7 @@ class _Records:
         return length > 0 and start + length > len(self._buffer)
 
     def _next_candidate(self, at: int) -> int:
-        """Where the next record may begin, after `at`."""
+        """The next position after `at` where a record may begin."""
         found = MAGIC.search(self._buffer, at + STAMP_SIZE + 1)
         if found:
             return found.start() - STAMP_SIZE

@@ -1,4 +1,4 @@
-"""Writes a simulated drive to files in the true wire formats: .tlog, candump .log, DBC, and what goes with them."""
+"""Writes a simulated drive to files in the real wire formats: .tlog, candump .log and DBC, with truth and configuration."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from fusiond.simulation.scenario import Scenario
 from fusiond.simulation.transport import Stamps
 from fusiond.simulation.truth import Truth
 from fusiond.simulation.wire import SYSTEM, Telemetry
-from fusiond.units import MICROSECOND
+from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.mavlink.tlog_record import tlog_record
 
 COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 HDOP, VDOP, SATELLITES = 80, 120, 14  # of a fix; the first two in hundredths
 CHANNEL = "can0"
-LINES_AT_ONCE = 4096  # of one id that are held ready
+LINES_AT_ONCE = 4096  # of one id that are formatted together
 TRUTH_COLUMNS = "unix_us,lat_deg,lon_deg,height_m,vn_mps,ve_mps,vd_mps,roll_deg,pitch_deg,yaw_deg"
 TRUTH_ROW = "%d,%.9f,%.9f,%.4f,%.5f,%.5f,%.5f,%.5f,%.5f,%.5f\n"
 
@@ -36,7 +36,7 @@ Stamped = Iterator[tuple[int, int, common.MAVLink_message]]  # receipt [us], fra
 
 
 def write_drive(scenario: Scenario, directory: str | Path, seed: int | None = None) -> list[Path]:
-    """Simulate a drive and write it; `seed` in place of the scenario's own. The folder is made if need be.
+    """Simulate a drive and write it; `seed` replaces the scenario's. The folder is created if missing.
 
     Returns the files: drive.tlog, drive.log, wheels.dbc, truth.csv, fusiond.toml. Raises OSError.
     """
@@ -54,7 +54,7 @@ def write_drive(scenario: Scenario, directory: str | Path, seed: int | None = No
 
 
 def write_tlog(drive: Drive, path: Path) -> None:
-    """The MAVLink messages in the order of receipt, as MAVLink 2 frames behind their stamps."""
+    """The MAVLink messages in the order of receipt, as MAVLink 2 frames after their stamps."""
     link = common.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     telemetry = (_telemetry(drive.truth, stream) for stream in drive.telemetry)
     streams = (_imu(drive), _gnss(drive), _system_time(drive), _heartbeats(drive), _pressure(drive), *telemetry)
@@ -195,9 +195,9 @@ def _lines(identifier: int, t_receive_us: Stamps, data: NDArray[np.uint64]) -> I
 
 
 def write_truth(truth: Truth, rate_hz: float, path: Path) -> None:
-    """The truth about the IMU, at most `rate_hz` rows a second; `unix_us` is the receiving host's time."""
+    """The truth of the IMU, at most `rate_hz` lines a second; `unix_us` is the receiving host's time."""
     interval_ns = int(np.diff(truth.t_ns[:2]).sum()) or 1
-    every = max(1, round(1e9 / rate_hz / interval_ns))
+    every = max(1, round(SECOND / rate_hz / interval_ns))
     angles = np.degrees(np.column_stack([truth.latitude, truth.longitude, truth.euler]))[::every]
     columns = (truth.t_ns // MICROSECOND, truth.height, truth.velocity_n)
     stamps, heights, velocities = (column[::every].tolist() for column in columns)

@@ -1,1 +1,1 @@
-"""ROS 2 without ROS: its messages over Zenoh, as rmw_zenoh expects them."""
+"""ROS 2 without ROS: its messages over Zenoh in the format of rmw_zenoh."""

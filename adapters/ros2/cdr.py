@@ -1,4 +1,4 @@
-"""ROS 2 messages in CDR: frequent messages are packed once, and afterwards only their numbers are replaced."""
+"""ROS 2 messages in CDR: frequent messages are packed once, then only their numbers are replaced."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SERVICE_UNKNOWN = 0
 COVARIANCE_TYPE_KNOWN = 3  # sensor_msgs/NavSatFix
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 STAMP = struct.Struct("<iI")  # s, ns
-HEADER = 4  # bytes before the first field: how it is encoded
+HEADER = 4  # bytes before the first field: the encoding
 
 _store = get_typestore(Stores.LATEST)
 
@@ -65,20 +65,20 @@ class Template:
     """The bytes of a message without its stamps and its numbers (consecutive 64-bit floats)."""
 
     def __init__(self, message: Any, numbers: int, behind: int = 0) -> None:
-        """`numbers` is how many stand together, `behind` how many bytes come after them."""
+        """`numbers` is the count of consecutive numbers, `behind` the count of bytes after them."""
         self._bytes = bytearray(_serialized(message))
         self._numbers = struct.Struct(f"<{numbers}d")
         self._at = len(self._bytes) - behind - self._numbers.size
 
     def packed(self, t_ns: int, numbers: Iterable[float]) -> bytes:
-        """The message at a time."""
+        """The message with a stamp and its numbers."""
         STAMP.pack_into(self._bytes, HEADER, *divmod(t_ns, SECOND))
         self._numbers.pack_into(self._bytes, self._at, *numbers)
         return bytes(self._bytes)
 
 
 class OdometryTemplate(Template):
-    """nav_msgs/Odometry: the pose in a frame, the twist in the body's."""
+    """nav_msgs/Odometry: the pose in a frame, the twist in the body frame."""
 
     def __init__(self, frame: str, child: str) -> None:
         position = _make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0)
@@ -93,7 +93,7 @@ class OdometryTemplate(Template):
 
 
 class TwistTemplate(Template):
-    """geometry_msgs/TwistWithCovarianceStamped in the body's frame."""
+    """geometry_msgs/TwistWithCovarianceStamped in the body frame."""
 
     def __init__(self, frame: str) -> None:
         super().__init__(_make(TWIST, _header(frame), _twist()), 6 + 36)
@@ -116,7 +116,7 @@ class FixTemplate(Template):
 
 
 class TransformsTemplate:
-    """tf2_msgs/TFMessage: a chain of frames, each placed in the one before it."""
+    """tf2_msgs/TFMessage: a chain of frames, each relative to the previous one."""
 
     def __init__(self, frames: Sequence[str]) -> None:
         transforms: list[Any] = []
@@ -125,8 +125,8 @@ class TransformsTemplate:
         self._numbers = struct.Struct("<7d")
         end = len(_serialized(_make(TF, transforms)))
         for parent, child in pairwise(frames):
-            still = _make("geometry_msgs/msg/Transform", _vector(), _quaternion())
-            transforms.append(_make("geometry_msgs/msg/TransformStamped", _header(parent), child, still))
+            identity = _make("geometry_msgs/msg/Transform", _vector(), _quaternion())
+            transforms.append(_make("geometry_msgs/msg/TransformStamped", _header(parent), child, identity))
             self._stamps.append(end)
             end = len(_serialized(_make(TF, transforms)))
             self._places.append(end - self._numbers.size)
@@ -154,7 +154,7 @@ def twist(state: LocalState, rate_variance: Triple) -> tuple[float, ...]:
 
 
 def six(upper: Block, lower: Block) -> tuple[float, ...]:
-    """The covariance (6, 6), row by row, of two triples whose errors are taken as independent."""
+    """The covariance (6, 6), row by row, of two triples with independent errors."""
     none = (0.0, 0.0, 0.0)
     above = (*upper[:3], *none, *upper[3:6], *none, *upper[6:], *none)
     return (*above, *none, *lower[:3], *none, *lower[3:6], *none, *lower[6:])

@@ -26,7 +26,7 @@ KINDS = {  # by topic
 
 
 class Converter:
-    """One vehicle. Its origin and its odometry frame last as long as it does."""
+    """Converts the messages of one vehicle; keeps its origin and its odometry frame."""
 
     def __init__(self, section: Ros2) -> None:
         self.unfit = 0  # messages without a usable state, which are not sent
@@ -45,9 +45,9 @@ class Converter:
             Mode.DEAD_RECKONING: cdr.FixTemplate(section.base_frame, cdr.STATUS_NO_FIX),
         }
         self._transforms = cdr.TransformsTemplate((section.map_frame, section.odom_frame, section.base_frame))
-        self._resets: int | None = None  # as last told
-        self._reset_ns: int | None = None  # when it was last seen to grow
-        self._dropped: dict[str, int] = {}  # by input or output, as last told
+        self._resets: int | None = None  # as last published
+        self._reset_ns: int | None = None  # of the last reset
+        self._dropped: dict[str, int] = {}  # by input or output, as last published
 
     @property
     def origin(self) -> str:
@@ -58,7 +58,7 @@ class Converter:
         return f"{math.degrees(latitude):.9f}, {math.degrees(longitude):.9f}, {height:.3f}"
 
     def state(self, message: StateMessage) -> Iterator[tuple[str, bytes]]:
-        """Topic and CDR of each message of a state; none while it is not due, and none of a state that is not fit."""
+        """Topic and CDR of each message of a state; none if it is not due or not usable."""
         slot = int(message.t_ns // self._period_ns)
         if slot == self._slot:
             return
@@ -121,8 +121,8 @@ def _source_status(name: str, source: SourceHealth) -> Status:
     values = {"rate [1/s]": source.rate_hz, "age [ms]": source.age_ms, "test ratio": source.test_ratio}
     values |= {"mean NIS": source.nis_mean, **_counts(source)}
     text = f"{status}: {source.reason}" if source.reason else status
-    told = {key: "" if value is None else value for key, value in values.items()}
-    return Status(OK if status == "nominal" else WARN, f"fusiond: {name}", text, told)
+    known = {key: "" if value is None else value for key, value in values.items()}
+    return Status(OK if status == "nominal" else WARN, f"fusiond: {name}", text, known)
 
 
 def _counts(part: HealthMessage | SourceHealth) -> dict[str, int]:

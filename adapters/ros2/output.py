@@ -1,6 +1,6 @@
-"""ROS 2 without ROS: the state and the health as nodes with rmw_zenoh see them. Needs the extra `ros2`.
+"""ROS 2 without ROS: state and health for nodes that use rmw_zenoh. Needs the extra `ros2`.
 
-A Zenoh session of its own, by default a client of the router that rmw_zenoh needs anyway. See docs/ros2.md.
+A Zenoh session of its own, by default a client of the router that rmw_zenoh needs. See docs/ros2.md.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CHECK_S = 1.0  # between two checks of the router
 
 
 def topics(section: Ros2) -> Iterator[tuple[str, Topic]]:
-    """Everything published, by what the converter calls it."""
+    """All topics, by their names in the converter."""
     for name, kind in KINDS.items():
         full = name if name.startswith("/") else f"{section.namespace.rstrip('/')}/{name}"
         type_hash = cdr.type_hash(kind) if section.type_hashes else NO_HASH
@@ -50,7 +50,7 @@ class Ros2Output:
         self.about = f"ROS 2 in domain {self._section.domain} by {', '.join(self._section.connect) or 'listening'}"
         self.outbox = Outbox(MAX_WAITING, (StateMessage, HealthMessage))
         self._converter = Converter(self._section)
-        self._publishers: Mapping[str, Publisher] = {}  # those of the session
+        self._publishers: Mapping[str, Publisher] = {}  # of the session
         self._sent = 0
 
     def session(self, stop: Event) -> None:
@@ -70,11 +70,11 @@ class Ros2Output:
             raise OutputLost(str(error)) from error
 
     def counts(self) -> dict[str, int]:
-        """Messages so far, counted by what was done with them."""
+        """Messages sent, and states without a usable state."""
         return {"sent": self._sent, "states unfit": self._converter.unfit}
 
     def notes(self) -> dict[str, str]:
-        """Notes for the health."""
+        """The origin of the map frame."""
         return {"origin": self._converter.origin}
 
     def _publish(self, session: zenoh.Session, stop: Event) -> None:
@@ -84,7 +84,7 @@ class Ros2Output:
             if time.monotonic() >= next_check:
                 next_check = time.monotonic() + CHECK_S
                 if self._section.mode == "client" and not _connected(session):
-                    raise OutputLost(f"no router is there any more: {', '.join(self._section.connect)}")
+                    raise OutputLost(f"the router is gone: {', '.join(self._section.connect)}")
         self._send(self.outbox.take(0))
 
     def _send(self, messages: Iterable[Message]) -> None:

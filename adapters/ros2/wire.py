@@ -1,8 +1,8 @@
-"""rmw_zenoh's protocol, as far as a publisher needs it: keys, type hashes, liveliness tokens, attachments.
+"""The part of rmw_zenoh's protocol that a publisher needs: keys, type hashes, liveliness tokens, attachments.
 
 After rmw_zenoh's docs/design.md and its sources (liveliness_utils.cpp, attachment_helpers.cpp, rmw_publisher_data.cpp).
-A node and its publishers are liveliness tokens that live as long as the session; a message is a CDR payload with an
-attachment, without which rmw_zenoh drops it.
+A node and its publishers are liveliness tokens that exist as long as the session. A message is a CDR payload with an
+attachment; without it rmw_zenoh drops the message.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from types import TracebackType
 import xxhash
 import zenoh
 
-NO_HASH = "TypeHashNotSupported"  # what ROS 2 Humble writes for a hash
+NO_HASH = "TypeHashNotSupported"  # what ROS 2 Humble uses for a hash
 ATTACHMENT = struct.Struct("<qqB16s")  # sequence number, source time [ns, Unix], length of the gid, gid
 GID_SIZE = 16  # bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """What is published: QoS is reliable, volatile, keep last `depth`; everything else rmw_zenoh's default."""
+    """A topic. Its QoS is reliable, volatile, keep last `depth`, otherwise rmw_zenoh's default."""
 
     name: str  # absolute, such as /odometry
     kind: str  # such as nav_msgs/msg/Odometry
@@ -33,7 +33,7 @@ class Topic:
 
 
 def topic_key(domain: int, topic: Topic) -> str:
-    """Where the messages of a topic are put."""
+    """The Zenoh key of the messages of a topic."""
     return f"{domain}/{topic.name.strip('/')}/{dds_type(topic.kind)}/{topic.hash}"
 
 
@@ -60,9 +60,9 @@ def publisher_token(domain: int, zid: str, node_id: int, entity_id: int, namespa
 
 
 def qos(depth: int) -> str:
-    """Reliability, durability, history, deadline, lifespan, liveliness; what is rmw_zenoh's default is left empty.
+    """Reliability, durability, history, deadline, lifespan, liveliness; rmw_zenoh's defaults are left empty.
 
-    A depth is always given: its default, 42, is not the same in every implementation.
+    The depth is always given: its default, 42, is not the same in every implementation.
     """
     return f"::,{depth}:,:,:,,"
 
@@ -75,12 +75,12 @@ def gid(token: str) -> bytes:
 class Publisher:
     """Publishes on one topic."""
 
-    def __init__(self, publisher: zenoh.Publisher, source: bytes) -> None:
-        self._publisher, self._gid = publisher, source
+    def __init__(self, publisher: zenoh.Publisher, gid: bytes) -> None:
+        self._publisher, self._gid = publisher, gid
         self._sequence = 0
 
     def put(self, payload: bytes) -> None:
-        """Send a CDR message. Raises zenoh.ZError where the session is closed."""
+        """Send a CDR message. Raises zenoh.ZError if the session is closed."""
         self._sequence += 1
         attachment = ATTACHMENT.pack(self._sequence, time.time_ns(), GID_SIZE, self._gid)
         self._publisher.put(payload, attachment=attachment)
@@ -89,14 +89,14 @@ class Publisher:
 class Node:
     """A node in the ROS graph. A context manager that must end before its session. Raises zenoh.ZError.
 
-    With `lossless` its publishers wait for readers that do not keep up; else they drop what finds no room on its way.
+    With `lossless` its publishers wait for slow readers; otherwise they drop messages for which there is no room.
     """
 
     def __init__(self, session: zenoh.Session, domain: int, namespace: str, name: str, *, lossless: bool = False) -> None:
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         self._session, self._domain, self._namespace, self._name = session, domain, namespace, name
         self._zid = str(session.info.zid())
-        self._entities = 0  # so far; the node itself is number 0
+        self._entities = 0  # declared so far; the node itself is number 0
         self._declared = ExitStack()
         self._declare_token(node_token(domain, self._zid, 0, namespace, name))
 
@@ -109,7 +109,7 @@ class Node:
                 topic_key(self._domain, topic),
                 congestion_control=self._congestion,
                 priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA,
-                express=False,  # the topics of one instant go in one batch; two batches wait at the most, others are dropped
+                express=False,  # the topics of one instant are one batch; at most two batches wait, others are dropped
             )
         )
         self._declare_token(token)

@@ -1,8 +1,8 @@
 """Zenoh as a live output: publishes messages in a thread of its own, states directly, and answers queries.
 
 A state is published in the estimator's thread: waking another thread would delay it, on a busy machine more than anything
-else does. Zenoh only queues the state, and drops it where the queue is full. In a replay, which has patience, everything
-goes through the outbox in order, and Zenoh waits for its readers.
+else. Zenoh only queues the state, and drops it if the queue is full. In a replay everything goes through the outbox in
+order, and Zenoh waits for its readers.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from fusiond.config.schema import Config
 from fusiond.messages.types import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant, StateMessage
 from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.zenoh.queries import Answers
-from fusiond_adapters.zenoh.session import TELL_LAST_S, PublishError, ZenohPublisher, open_session
+from fusiond_adapters.zenoh.session import LAST_SAMPLE_S, PublishError, ZenohPublisher, open_session
 
 QUEUE_MESSAGES = 1024  # a second of everything, and more
-READER_S = 0.002  # that a reader may take for a message at the end of a replay, see _linger
-MIN_LINGER_S, MAX_LINGER_S = TELL_LAST_S + 0.2, 5.0  # all that waits in Zenoh's queues is some thousands of messages
+READER_S = 0.002  # time of a slow reader for a message, at the end of a replay: see _linger
+MIN_LINGER_S, MAX_LINGER_S = LAST_SAMPLE_S + 0.2, 5.0  # Zenoh's queues have some thousands of messages
 
 
 class ZenohOutput:
-    """[zenoh] of a configuration. Live, it never waits for a reader, and counts what it cannot send."""
+    """[zenoh] of a configuration. In a live run it never waits for a reader, and counts the messages that it cannot send."""
 
     def __init__(self, config: Config) -> None:
         self.name = "zenoh"
@@ -34,8 +34,8 @@ class ZenohOutput:
         self.about = f"Zenoh ({', '.join([section.mode, *section.listen, *section.connect])})"
         self.outbox = Outbox(QUEUE_MESSAGES, tuple(MESSAGES.values()))
         self.sessions = self.stale = 0
-        self._sent = self._sent_at_once = 0  # by the one thread and the other
-        self._read_s = 0.0  # monotonic: when a slow reader would have taken all that was sent
+        self._sent = self._sent_at_once = 0  # by the output's thread and by the estimator's
+        self._read_s = 0.0  # monotonic: when a slow reader would have read all messages sent
         self.answers = Answers(config)
         self._config = config
         self._notes: dict[str, str] = {}
@@ -66,25 +66,25 @@ class ZenohOutput:
                 self.stale += 1
             else:
                 self._send(publisher, message)
-        self._look(session)
+        self._update_notes(session)
         stopping = False
         while not stopping:
-            stopping = stop.is_set()  # and then what is left
+            stopping = stop.is_set()  # read before the last poll, so that no message is missed
             for message in self.outbox.take(0 if stopping else POLL_S):
                 self._send(publisher, message)
-                if isinstance(message, HealthMessage):  # for the next one: each second or so
-                    self._look(session)
+                if isinstance(message, HealthMessage):  # about each second: update the notes for the next one
+                    self._update_notes(session)
         if self.outbox.patience_s:
             self._linger(publisher)
 
     def _linger(self, publisher: ZenohPublisher) -> None:
-        """A session that is closed drops what its readers have not taken yet, and Zenoh does not say what they have: give
-        them the time in which one that takes READER_S for each message would have taken all."""
+        """Closing a session drops the messages that its readers have not read yet, and Zenoh does not report which: wait as
+        long as a reader that needs READER_S for each message needs for all of them."""
         longest_s = MAX_LINGER_S if publisher.matched else MIN_LINGER_S
         time.sleep(min(longest_s, max(MIN_LINGER_S, self._read_s - time.monotonic())))
 
-    def _look(self, session: zenoh.Session) -> None:
-        """Look up the peers of the session. This may wait for Zenoh, so the estimator's thread must not do it."""
+    def _update_notes(self, session: zenoh.Session) -> None:
+        """Count the peers of the session. This may wait for Zenoh, so the estimator's thread must not do it."""
         routers, peers = len(session.info.routers_zid()), len(session.info.peers_zid())
         self._notes = {"session": f"{routers} routers, {peers} peers connected"}
 
@@ -98,22 +98,22 @@ class ZenohOutput:
         try:
             publisher.publish(state)
         except PublishError:
-            return False  # the output's own thread finds the session lost
+            return False  # the output's own thread detects the loss
         self.answers.keep(state)
         self._sent_at_once += 1
         return True
 
     @property
     def sent(self) -> int:
-        """Messages so far."""
+        """Number of messages sent."""
         return self._sent + self._sent_at_once
 
     def counts(self) -> dict[str, int]:
-        """Messages so far, counted by what was done with them."""
+        """Messages sent, stale messages, sessions, and queries answered."""
         return {"sent": self.sent, "stale": self.stale, "sessions": self.sessions, "answered": self.answers.answered}
 
     def notes(self) -> dict[str, str]:
-        """The peers it is connected to."""
+        """The number of routers and peers connected."""
         return self._notes
 
 

@@ -1,7 +1,7 @@
 """Answers to Zenoh queries: the latest message of every kind, and the state at an instant within the horizon.
 
-They come from published messages that are kept here, never from the filter. `fusiond/<vehicle>/state?t_ns=...`
-gives the state published nearest to that instant, as the filter knew it then.
+They come from published messages that are kept here, never from the filter. `fusiond/<vehicle>/state?t_ns=...` returns
+the published state nearest to that instant.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Answers:
         self._lock = Lock()
 
     def keep(self, message: Message) -> None:
-        """Take a message that was published."""
+        """Keep a published message."""
         where = message_key(message, self._vehicle)
         with self._lock:
             self._latest[where] = message
@@ -44,19 +44,19 @@ class Answers:
 
     @contextmanager
     def declared(self, session: zenoh.Session) -> Iterator[None]:
-        """Answers the queries of a session, inside the block."""
+        """Inside the block, answers the queries of a session."""
         with session.declare_queryable(key_of(self._vehicle, "**"), self._answer):
             yield
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            asked = query.key_expr
+            selected = query.key_expr
             t_ns = query.parameters.get("t_ns")
             if t_ns is not None:
                 self._answer_at(query, t_ns)
                 return
             with self._lock:
-                found = {where: message for where, message in self._latest.items() if asked.intersects(where)}
+                found = {where: message for where, message in self._latest.items() if selected.intersects(where)}
             for where, message in found.items():
                 self._reply(query, where, message)
 
@@ -72,7 +72,7 @@ class Answers:
             self._reply(query, where, state)
 
     def state_at(self, t_ns: int) -> StateMessage | None:
-        """The state published nearest to an instant; None if that is over a period away."""
+        """The published state nearest to an instant; None if it is more than a period away."""
         with self._lock:
             nearest = min(self._states, key=lambda state: abs(state.t_ns - t_ns), default=None)
         return nearest if nearest is not None and abs(nearest.t_ns - t_ns) <= self._period_ns else None

@@ -1,7 +1,7 @@
 """Zenoh: a session on loopback unless configured otherwise, and the publishers of all messages.
 
 By default a session uses loopback only: no multicast scouting, no gossip, no listener on other interfaces. Publishing
-waits hardly at all. Streams (state, settled, innovations) lose samples when a reader cannot keep up. Rare messages
+waits a millisecond at most. Streams (state, settled, innovations) lose samples when a reader is too slow. Rare messages
 (health, events, info, config) are kept here; readers that miss one or connect later fetch it.
 """
 
@@ -27,10 +27,10 @@ from fusiond.messages.types import MESSAGES, InnovationMessage, Message
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
 KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples kept for readers that missed them
-RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting: Zenoh's own is 1 to 4 s
-QUEUED = 16  # samples on their way to a reader, of a priority; Zenoh has 2, and loses the rest of a burst
-PATIENCE_US = 1000  # with which a sample waits for room there, as Zenoh has it
-TELL_LAST_S = 1.0  # a reader hears within this that it missed the last one
+RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting; Zenoh's own is 1 to 4 s
+QUEUED = 16  # samples in the queue of a priority; Zenoh's default of 2 loses the rest of a burst
+PATIENCE_US = 1000  # how long a sample waits for room in the queue; Zenoh's default
+LAST_SAMPLE_S = 1.0  # within this time a reader learns that it missed the last sample
 WAIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
 KIND = {message: kind for kind, message in MESSAGES.items()}
 
@@ -38,16 +38,16 @@ CONTENT_TYPES: dict[Encoding, str] = {"json": "application/json", "msgpack": "ap
 
 
 class PublishError(Exception):
-    """Zenoh cannot be set up or used; the message says what was asked and why it failed."""
+    """Zenoh cannot be set up or used; the message says what was tried and why it failed."""
 
 
 def state_key(vehicle: str) -> str:
-    """Where the state of a vehicle is published."""
+    """The key of the state of a vehicle."""
     return key_of(vehicle, "state")
 
 
 def message_key(message: Message, vehicle: str) -> str:
-    """Where a message is published."""
+    """The key of a message."""
     return key_of(vehicle, KIND[type(message)], message.source if isinstance(message, InnovationMessage) else "")
 
 
@@ -59,7 +59,7 @@ def alive_key(vehicle: str) -> str:
 def open_session(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Session:
     """A session as configured; close it (it is a context manager) after its publishers. Raises PublishError.
 
-    Publishing waits for a reader whose queue is full PATIENCE_US, before it drops the sample; not at all unless `patient`.
+    If the queue of a reader is full, publishing waits PATIENCE_US before it drops the sample; only if `patient`.
     """
     config = session_config(section, directory, patient=patient)
     what = f"zenoh: cannot open a {section.mode}, listen {section.listen}, connect {section.connect}"
@@ -70,10 +70,10 @@ def open_session(section: ZenohSection, directory: str | Path = ".", *, patient:
 def session_config(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Config:
     """Zenoh's configuration: its own file first (relative to `directory`), then the section. Raises PublishError.
 
-    A key of the section that is left at its default yields to the file, where the file says other than Zenoh's default.
+    A key of the section that has its default yields to the file if that differs from Zenoh's default.
     """
     config = _from_file(Path(directory) / section.config_file) if section.config_file else zenoh.Config()
-    untouched, default = zenoh.Config(), ZenohSection()
+    defaults, default = zenoh.Config(), ZenohSection()
     for key, value, usual in (
         ("mode", section.mode, default.mode),
         ("listen/endpoints", section.listen, default.listen),
@@ -85,7 +85,7 @@ def session_config(section: ZenohSection, directory: str | Path = ".", *, patien
         ("transport/link/tx/queue/size/data", QUEUED, QUEUED),
         (WAIT, PATIENCE_US if patient else 0, PATIENCE_US),
     ):
-        if value != usual or config.get_json(key) == untouched.get_json(key):
+        if value != usual or config.get_json(key) == defaults.get_json(key):
             with _explained(f"zenoh: {key} cannot be {value!r}"):
                 config.insert_json5(key, json.dumps(value))
     return config
@@ -98,7 +98,7 @@ def _from_file(path: Path) -> zenoh.Config:
 
 @contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn Zenoh's error into ours: what was tried, and the reason without locations in Zenoh's source."""
+    """Convert Zenoh's error into a PublishError: what was tried, and the reason without locations in Zenoh's source."""
     try:
         yield
     except zenoh.ZError as error:
@@ -109,8 +109,8 @@ def _explained(what: str) -> Iterator[None]:
 class ZenohPublisher:
     """Publishes messages of all kinds, and a liveliness token as long as it exists.
 
-    A context manager; it must end before its session is closed. Raises PublishError where it cannot be declared. With
-    `lossless` it waits for readers that do not keep up (Zenoh leaves those that take nothing for 5 s), and drops nothing.
+    A context manager; it must end before its session is closed. Raises PublishError if it cannot be declared. With
+    `lossless` it waits for slow readers and drops nothing (Zenoh disconnects readers that read nothing for 5 s).
     """
 
     def __init__(self, session: zenoh.Session, vehicle: str, encoding: Encoding, *, lossless: bool = False) -> None:
@@ -121,7 +121,7 @@ class ZenohPublisher:
         self._closed = False
         with _explained(f"zenoh: cannot publish on {key_of(vehicle, '**')}"), ExitStack() as declared:
             for kind in MESSAGES:
-                if kind != "innovations":  # each source's is declared when it comes
+                if kind != "innovations":  # each source's is declared with its first message
                     self._declare(key_of(vehicle, kind), kind, declared)
             declared.enter_context(session.liveliness().declare_token(alive_key(vehicle)))
             self._declared = declared.pop_all()
@@ -144,7 +144,7 @@ class ZenohPublisher:
                 encoding=encoding,
                 congestion_control=congestion,
                 cache=zenoh.ext.CacheConfig(KEPT[kind]),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=TELL_LAST_S),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=LAST_SAMPLE_S),
                 publisher_detection=True,
             )
         declared.enter_context(publisher)
@@ -152,13 +152,13 @@ class ZenohPublisher:
 
     @property
     def matched(self) -> bool:
-        """Whether anyone subscribes to the state."""
+        """Whether there is a subscriber to the state."""
         publisher = cast(zenoh.Publisher, self._publishers[state_key(self.vehicle)])
-        status = cast(zenoh.MatchingStatus, publisher.matching_status)  # its stub says bool, which it is not
+        status = cast(zenoh.MatchingStatus, publisher.matching_status)  # its stub wrongly says bool
         return bool(status.matching)
 
     def publish(self, message: Message) -> None:
-        """Send a message to all subscribers. Raises PublishError where the session is closed."""
+        """Send a message to all subscribers. Raises PublishError if the session is closed."""
         where = message_key(message, self.vehicle)
         payload = encode(message, self._encoding)
         if self._closed:

@@ -1,4 +1,4 @@
-"""What the kernel tells beside a CAN frame, and what a CAN bus makes of its error frames."""
+"""CAN frames from a socket, with the kernel's stamps and its count of dropped frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from fusiond_adapters.can.kernel_socket import SO_RXQ_OVFL, SO_TIMESTAMPNS, CanFrame, CanSocket, frame_of, told_by
+from fusiond_adapters.can.kernel_socket import SO_RXQ_OVFL, SO_TIMESTAMPNS, CanFrame, CanSocket, frame_of, stamp_and_drops
 
 
 def can_frame(number: int, data: bytes, flags: int = 0, size: int = 16) -> bytes:
@@ -38,14 +38,14 @@ def test_control_messages() -> None:
     stamp = (socket.SOL_SOCKET, SO_TIMESTAMPNS, struct.pack("@ll", 1_700_000_000, 123_456_789))
     lost = (socket.SOL_SOCKET, SO_RXQ_OVFL, struct.pack("=I", 4_000_000_000))
     other = (socket.SOL_SOCKET, 99, bytes(16))
-    assert told_by([stamp]) == (1_700_000_000_123_456_789, None)
-    assert told_by([other, lost, stamp]) == (1_700_000_000_123_456_789, 4_000_000_000)
-    assert told_by([(socket.SOL_SOCKET, SO_RXQ_OVFL, b"\0")]) == (None, None)
-    assert told_by([]) == (None, None)
+    assert stamp_and_drops([stamp]) == (1_700_000_000_123_456_789, None)
+    assert stamp_and_drops([other, lost, stamp]) == (1_700_000_000_123_456_789, 4_000_000_000)
+    assert stamp_and_drops([(socket.SOL_SOCKET, SO_RXQ_OVFL, b"\0")]) == (None, None)
+    assert stamp_and_drops([]) == (None, None)
 
 
-def test_the_kernel_tells_of_an_overflow() -> None:
-    """The socket option is the same for every datagram socket: here one of UDP that is not read in time."""
+def test_the_kernel_counts_dropped_frames() -> None:
+    """The socket option is the same for every datagram socket: here a UDP socket that is not read in time."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,

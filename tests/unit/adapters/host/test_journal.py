@@ -89,7 +89,7 @@ def test_repeated_warnings_are_counted() -> None:
         record = logging.makeLogRecord({"msg": "lost: %s", "args": ("no route",), "levelno": logging.WARNING})
         if repeats.filter(record):
             said.append(record.getMessage())
-    assert said == ["lost: no route"] + ["lost: no route (29 times more in the 30 s before)"] * 3
+    assert said == ["lost: no route"] + ["lost: no route (29 more times in the last 30 s)"] * 3
     mode = {"msg": "mode: nominal", "levelno": logging.INFO, **journal.about("mode", "nominal")}
     assert all(repeats.filter(logging.makeLogRecord(mode)) for _ in range(3))
     chatter = {"msg": "the controller is active", "levelno": logging.INFO}
@@ -100,10 +100,10 @@ def test_what_repeats_remembers_is_bounded() -> None:
     repeats = journal.Repeats(lambda: 0.0)
     for number in range(10 * journal.MAX_KEPT):
         repeats.filter(logging.makeLogRecord({"msg": f"{number}", "levelno": logging.ERROR}))
-    assert len(repeats._said) == journal.MAX_KEPT
+    assert len(repeats._logged) == journal.MAX_KEPT
 
 
-def test_the_journal_is_told_from_other_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_journal_is_distinguished_from_other_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (tmp_path / "stderr").open("w") as stream:
         status = os.fstat(stream.fileno())
         monkeypatch.setattr(sys, "stderr", stream)

@@ -37,11 +37,11 @@ def test_two_buses_in_one_log(tmp_path: Path) -> None:
     assert Counter(event.source for event in found) == dict.fromkeys([*WHEELS, "w"], 10)
 
 
-def test_the_only_channel_is_taken_for_the_only_bus(tmp_path: Path) -> None:
+def test_the_only_channel_is_used_as_the_only_bus(tmp_path: Path) -> None:
     log = candump(tmp_path / "drive.log", "vcan3")
     logs = open_logs([log], configured("body"))
     assert len(list(logs)) == 40
-    assert logs.warnings == [f"{log}: channel vcan3 is taken for the bus body"]
+    assert logs.warnings == [f"{log}: channel vcan3 is used as the bus body"]
     assert len(list(open_logs([f"body={log}"], configured("body", "can9")))) == 40
 
 
@@ -63,6 +63,6 @@ def test_a_format_without_channels_needs_the_bus_where_there_are_two(tmp_path: P
     path = written(tmp_path / "drive.csv")
     rear = '[can.rear]\ndbc = ["rav4.dbc"]\n[wheel.w]\nbus = "rear"\nmessage = "WHEEL_SPEEDS"\n'
     settings = configured(more=rear + 'signal = "WHEEL_SPEED_FL"\n')
-    with pytest.raises(LogError, match="no channels; say whose it is: BUS="):
+    with pytest.raises(LogError, match="no channels; name the bus: BUS="):
         events(path, settings)
     assert Counter(event.source for event in open_logs([f"rear={path}"], settings)) == {"w": 40}

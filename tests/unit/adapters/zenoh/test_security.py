@@ -123,7 +123,7 @@ def test_a_vehicle_cannot_read(samples: Path, endpoint: str) -> None:
         Client(endpoint, "rover", config_file=samples / "vehicle.json5", timeout_s=1.0) as spy,
     ):
         rover.publish(event("secret"))
-        with pytest.raises(ClientError, match="fusiond/rover/events: nobody answers"):
+        with pytest.raises(ClientError, match="fusiond/rover/events: no answer"):
             spy.latest(EventMessage)
 
 
