@@ -10,25 +10,8 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, get_args, get_origi
 
 from msgspec import Meta, field
 
-from fusiond.config.outputs import (
-    Autopilot,
-    Foxglove,
-    GroundStation,
-    Mcap,
-    Prometheus,
-    Publish,
-    Record,
-    Ros2,
-    Zenoh,
-)
-from fusiond.config.sensor import (
-    INERTIAL,
-    Sensor,
-    Stream,
-    delay_in_words,
-    point_in_words,
-    vector_in_words,
-)
+from fusiond.config.outputs import Autopilot, Foxglove, GroundStation, Mcap, Prometheus, Publish, Record, Ros2, Zenoh
+from fusiond.config.sensor import INERTIAL, Sensor, Stream, delay_in_words, point_in_words, vector_in_words
 from fusiond.config.toml import Name, NotNegative, Positive, Section, Vector
 from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Pressure, WheelSpeed
 from fusiond.units import MILLISECOND
