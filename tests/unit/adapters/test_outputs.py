@@ -113,13 +113,6 @@ def driven(
         yield run, lambda until: drive(run, lambda data: peer.sendto(data, ("127.0.0.1", port)), wheels, until, autopilot)
 
 
-# --- The outbox
-
-
-def event(text: str) -> EventMessage:
-    return EventMessage(vehicle="v", t_ns=1, kind="mode", severity="info", subject="", text=text)
-
-
 # --- Supervision
 
 
@@ -256,26 +249,6 @@ def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[Config, Path, 
         assert {name: value for name, value in left.items() if name not in shell} == {
             name: value for name, value in right.items() if name not in shell
         }
-
-
-def test_a_state_goes_at_once_where_the_output_can_and_waits_where_it_cannot(
-    recorded: tuple[Config, Path, list[Message], Running],
-) -> None:
-    first, second, *_ = (message for message in recorded[2] if isinstance(message, StateMessage))
-    sent: list[StateMessage] = []
-
-    def send(state: StateMessage) -> bool:
-        if able := state is first:
-            sent.append(state)
-        return able
-
-    outbox = Outbox(3, (StateMessage, EventMessage))
-    outbox.attend(lambda: first.t_ns + 7, lambda: None)
-    outbox.at_once = send
-    for message in (first, event("queued"), second):
-        outbox.put(message)
-    assert (sent, outbox.take(0), outbox.offered, outbox.dropped) == ([first], [event("queued"), second], 3, 0)
-    assert outbox.latency.count == 2
 
 
 def test_info_and_config_say_what_runs(recorded: tuple[Config, Path, list[Message], Running]) -> None:
