@@ -143,7 +143,7 @@ def one_row(kernel: Kernel, head: FilterState, fusion: Fusion, source: str) -> C
     table[0]["values"][: len(values)] = values
     kept = np.zeros((2, len(head.numbers))), np.zeros((2, len(head.whole)), dtype=np.int64), np.zeros(2, dtype=np.int64)
     kept[1][:] = head.whole
-    kernel.attach(head, table, np.zeros((len(fusion.plan.sources), 6), dtype=np.int64), *kept)
+    kernel.attach(head, table, np.zeros((len(fusion.params.sources), 6), dtype=np.int64), *kept)
     now = int(head.stamps[T])
 
     def run() -> None:
@@ -156,7 +156,7 @@ def one_row(kernel: Kernel, head: FilterState, fusion: Fusion, source: str) -> C
 def kernel_lines(repeats: int) -> tuple[list[Line], Callable[[], object]]:
     """The kernel against its twin, and one propagation called from Python, which is the reference of the rewinds."""
     fusion, _ = running(200, 3.0)
-    fast, twin = make_kernel(fusion.plan, True), make_kernel(fusion.plan, False)
+    fast, twin = make_kernel(fusion.params, True), make_kernel(fusion.params, False)
     head = fusion.history.head
     state, other = head.copy(), head.copy()
 

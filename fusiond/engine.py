@@ -60,7 +60,7 @@ class Engine:
         self._sink, self._pace = sink, pace
         self._period = SECOND / Fraction(rate_hz or config.publish.rate_hz).limit_denominator(RATE_DENOMINATOR)
         self._wait_ns = int(self._period / 2) if config.publish.on_imu else 0  # how long a tick waits for an inertial sample
-        self._imu = self.fusion.plan.sources[self.fusion.plan.imu_source]
+        self._imu = self.fusion.params.sources[self.fusion.params.imu_source]
         self._tick = 0  # number of the next tick
         self._prepared: StateMessage | None = None  # its state, if no event comes before it
         self._last: tuple[int, StateMessage] | None = None  # the last tick, until its other messages are published

@@ -16,7 +16,7 @@ from fusiond.config.schema import Config
 from fusiond.filter.motion_constraints import NON_HOLONOMIC
 from fusiond.filter.observations import CONSTRAINTS, IMU, MODEL, MODELS
 from fusiond.filter.observations.model import Observation, with_rate_noise
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -92,7 +92,7 @@ class Bound:
 
     def __init__(self, world: World, wheel_hz: float, gnss_from: float = 0.0, gnss_until: float = np.inf) -> None:
         self.world, self.config = world, world.config
-        self.plan = plan(self.config)
+        self.params = make_parameters(self.config)
         gnss = next(iter(self.config.gnss.values()))
         fixes = world.times(gnss.interval_s, 0.0)
         self.events = [(t, "gnss") for t in fixes if gnss_from - 1e-9 <= t < gnss_until]
@@ -104,7 +104,7 @@ class Bound:
     def run(self, looks: list[float]) -> Array:
         """Covariances (looks, n, n), each after all measurements stamped up to its time [s]."""
         world, density = self.world, densities(self.config)
-        p, now, found = start_covariance(world, self.plan), 0.0, []
+        p, now, found = start_covariance(world, self.params), 0.0, []
         stops = sorted([*self.events, *((t + 1e-9, "look") for t in looks), *((t, "sample") for t in world.t[1:])])
         f = dynamics(world, 0)
         for t, what in stops:
@@ -123,7 +123,7 @@ class Bound:
         """The covariance after all measurements of a kind at one instant."""
         world = self.world
         k = min(round(t * world.sensor.rate_hz), len(world.t) - 1)
-        state = true_state(world, k, self.plan)
+        state = true_state(world, k, self.params)
         if what == "wheel":  # beside the IMU's instants
             at = np.array([t])
             kinematics = world.kinematics(at)
@@ -132,21 +132,21 @@ class Bound:
             state.nominal[QUATERNION_EB] = quaternion(to_n.T @ kinematics.mat_nb[0])
             state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = kinematics.rate_nb_b[0] + world.gyro_bias[k]
         between = t * world.sensor.rate_hz % 1.0 if what == "wheel" else 0.0  # two samples are interpolated
-        density = square(self.plan.imu.gyro_noise) * world.sensor.rate_hz
+        density = square(self.params.imu.gyro_noise) * world.sensor.rate_hz
         state.auxiliary[RATE_VARIANCE] = density * ((1 - between) ** 2 + between**2)
         state.covariance[:] = p
         if what == "constraint":
-            parameter = self.plan.constraints[NON_HOLONOMIC]
+            parameter = self.params.constraints[NON_HOLONOMIC]
             seen = Observation(state.size)
             if not CONSTRAINTS[NON_HOLONOMIC].observe(state, parameter, parameter, seen):
                 return p
             with_rate_noise(state, seen)
             return updated(p, seen)
-        for source, number in enumerate(self.plan.models):
+        for source, number in enumerate(self.params.models):
             if number == IMU or (number == MODEL["wheel_speed"]) != (what == "wheel"):
                 continue
             seen = Observation(state.size)
-            is_seen = MODELS[number].observe(state, self.row(number, source), self.plan.parameters[source], seen)
+            is_seen = MODELS[number].observe(state, self.row(number, source), self.params.model_parameters[source], seen)
             assert is_seen
             with_rate_noise(state, seen)
             p = updated(p, seen)
@@ -161,5 +161,5 @@ class Bound:
         elif number == MODEL["gnss_velocity"]:
             row[3:5] = square(gnss.velocity_sigma_mps), 3.0
         else:
-            row[1] = square(self.config.wheel[self.plan.sources[source]].sigma_mps)
+            row[1] = square(self.config.wheel[self.params.sources[source]].sigma_mps)
         return row

@@ -83,7 +83,7 @@ def least(config: Config, rounds: int, seed: list[int]) -> Array:
 def one(config: Config, rounds: int, seed: list[int]) -> Run:
     random = np.random.default_rng(seed)
     world, fusion = begun(nominal.scenario(rounds, imu_hz=IMU_HZ), config, random)
-    ledger, constraint = Ledger(fusion), fusion.plan.gates[2]
+    ledger, constraint = Ledger(fusion), fusion.params.gates[2]
     errors, claimed = [], []
     nis: dict[str, list[float]] = {CONSTRAINT: []}
 
@@ -97,8 +97,8 @@ def one(config: Config, rounds: int, seed: list[int]) -> Run:
 
     drive(fusion, Sensors(world, WHEEL_HZ).measurements(), instants(rounds), look, ledger)
     freedom, rejected = {CONSTRAINT: 2}, {}
-    for i, source in enumerate(fusion.plan.sources):
-        if fusion.plan.models[i] != IMU:
+    for i, source in enumerate(fusion.params.sources):
+        if fusion.params.models[i] != IMU:
             values, freedom[source] = ledger.normalised(source)[1:]
             nis[source], rejected[source] = values.tolist(), float(ledger.rejected(source)[1].mean())
     return Run(np.array(errors), np.array(claimed), nis, freedom, rejected)

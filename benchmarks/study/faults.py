@@ -69,7 +69,7 @@ def watched(
     random, config = np.random.default_rng(seed), nominal.config(**changes)
     world, fusion = begun(nominal.scenario(rounds, course=course, imu_hz=IMU_HZ), config, random)
     looks = np.arange(LOOK_S, world.t[-1], LOOK_S).tolist()
-    statuses: dict[str, list[str]] = {source: [] for source in fusion.plan.sources}
+    statuses: dict[str, list[str]] = {source: [] for source in fusion.params.sources}
     errors: list[float] = []
 
     def look(t: float, k: int) -> None:

@@ -15,7 +15,7 @@ from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import Measurement
 from fusiond.filter.motion_constraints import watch
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Outcome, Rows
 from fusiond.filter.state import (
     ACCEL_BIAS,
@@ -71,11 +71,11 @@ def spread(work: Callable[..., Result], jobs: Sequence[tuple[Any, ...]]) -> list
         return list(pool.map(work, *zip(*jobs, strict=True)))
 
 
-def start_covariance(world: World, plan: Plan) -> Array:
+def start_covariance(world: World, params: Parameters) -> Array:
     """The covariance (n, n) of a start from the truth."""
-    unit = plan.imu
-    level, heading = np.radians([plan.filter.level_sigma_deg, plan.filter.heading_sigma_deg])
-    sigmas = np.zeros(plan.size)
+    unit = params.imu
+    level, heading = np.radians([params.filter.level_sigma_deg, params.filter.heading_sigma_deg])
+    sigmas = np.zeros(params.size)
     for block, sigma in (
         (POSITION, START_POSITION),
         (VELOCITY, START_VELOCITY),
@@ -83,21 +83,21 @@ def start_covariance(world: World, plan: Plan) -> Array:
         (ACCEL_BIAS, unit.accel_bias_sigma),
     ):
         sigmas[block] = sigma
-    sigmas[CALIBRATIONS:] = np.sqrt(plan.calibration_variances)
+    sigmas[CALIBRATIONS:] = np.sqrt(params.calibration_variances)
     covariance = np.diag(sigmas**2)
     to_n = world.mat_ne[0]
     covariance[ATTITUDE, ATTITUDE] = to_n.T @ np.diag([level**2, level**2, heading**2]) @ to_n
     return covariance
 
 
-def true_state(world: World, k: int, plan: Plan) -> FilterState:
+def true_state(world: World, k: int, params: Parameters) -> FilterState:
     """A filter state that holds the truth at the IMU's k-th instant."""
-    state = FilterState(len(plan.sources), plan.size)
+    state = FilterState(len(params.sources), params.size)
     x = state.nominal
     x[POSITION_E], x[VELOCITY_E] = world.position_e[k], world.velocity_e[k]
     x[QUATERNION_EB] = quaternion(world.mat_eb[k])
     x[GYRO_BIAS_B], x[ACCEL_BIAS_B] = world.gyro_bias[k], world.accel_bias[k]
-    x[CALIBRATIONS + 1 : plan.size + 1] = world.calibrations[k, : plan.size - CALIBRATIONS]
+    x[CALIBRATIONS + 1 : params.size + 1] = world.calibrations[k, : params.size - CALIBRATIONS]
     state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = world.rate_b[k] + world.gyro_bias[k]
     state.auxiliary[FORCE_B] = world.force_b[k] + world.accel_bias[k]
     return state
@@ -113,8 +113,8 @@ def begun(scenario: Scenario, config: Config, random: np.random.Generator) -> tu
 def started(fusion: Fusion, world: World, random: np.random.Generator) -> None:
     """Make the filter run from the first instant on: off the truth by one draw of `start_covariance`. Calibrations were
     drawn with the world, so their estimates start at nothing."""
-    state = true_state(world, 0, fusion.plan)
-    covariance = start_covariance(world, fusion.plan)
+    state = true_state(world, 0, fusion.params)
+    covariance = start_covariance(world, fusion.params)
     off = np.linalg.cholesky(covariance + 1e-30 * np.eye(len(covariance))) @ random.standard_normal(len(covariance))
     x = state.nominal
     x[POSITION_E] -= off[POSITION]
@@ -126,7 +126,7 @@ def started(fusion: Fusion, world: World, random: np.random.Generator) -> None:
     state.auxiliary[HELD_FORCE_B] = state.auxiliary[FORCE_B] = world.accel[0]
     state.auxiliary[HELD_RATE_B] = state.auxiliary[RATE_B] = world.gyro[0]
     state.stamps[[T, T_IMU, T_CONSTRAINT, T_POSITION, T_START]] = T0
-    watch(state, world.accel[0], world.gyro[0], 1 / world.sensor.rate_hz, fusion.plan)
+    watch(state, world.accel[0], world.gyro[0], 1 / world.sensor.rate_hz, fusion.params)
     state.stamps[PHASE] = RUNNING
     history = fusion.history
     history.head.copy_from(state)
@@ -195,7 +195,7 @@ class Ledger:
         rows = self.of(source)
         rows = rows[rows["ratio"] > 0]
         freedom = int(np.count_nonzero(rows["variance"][0] > 0)) if len(rows) else 1
-        return seconds(rows), rows["ratio"] * self.fusion.plan.gates[freedom], freedom
+        return seconds(rows), rows["ratio"] * self.fusion.params.gates[freedom], freedom
 
     def rejected(self, source: str) -> tuple[Array, NDArray[np.bool_]]:
         """Times [s] and whether each event was rejected."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fusiond.config.schema import Config, Wheel, wheel_groups
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
-from fusiond.filter.parameters import plan, scale_state
+from fusiond.filter.parameters import make_parameters, scale_state
 from fusiond.filter.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import ECCENTRICITY2
@@ -67,7 +67,7 @@ class World:
         motion = config.motion
         self.config, self.random = config, random
         first = np.zeros(WIDE_SIZE - CALIBRATIONS)
-        variances = plan(config).calibration_variances
+        variances = make_parameters(config).calibration_variances
         first[: len(variances)] = np.sqrt(variances)
         self.drawn = Drawn(first * random.standard_normal(len(first)))
         (unit,) = config.imu.values()

@@ -18,7 +18,7 @@ from fusiond.filter.kernel.interpreted import AnyKernel
 from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations import IMU, MODELS
 from fusiond.filter.observations.model import Unusable, within
-from fusiond.filter.parameters import model_of, plan
+from fusiond.filter.parameters import make_parameters, model_of
 from fusiond.filter.rows import Outcome
 from fusiond.filter.source_health import Belief, belief
 from fusiond.filter.state import (
@@ -75,15 +75,15 @@ class Fusion:
         if stored is not None:
             check(stored, config)
         self.config = config
-        self.plan = plan(config, stored)
+        self.params = make_parameters(config, stored)
         self.clock = Clock(config)
-        self.history = History(self.plan, compiled)
-        self._predicted = FilterState(len(self.plan.sources), self.plan.size)  # the head, predicted to an instant
+        self.history = History(self.params, compiled)
+        self._predicted = FilterState(len(self.params.sources), self.params.size)  # the head, predicted to an instant
         self._encoders: dict[str, tuple[Callable[[Any, Any], tuple[float, ...]], Any]] = {  # payload and section to numbers
             source: (imu_values if (model := model_of(found.stream)) == IMU else MODELS[model].values, found.section)
             for source, found in config.streams().items()
         }
-        self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.plan.sources}
+        self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.params.sources}
 
     def feed(self, received: Received) -> Receipt | None:
         """Align an event and fuse it. None for an event that only informs the clock.
@@ -97,7 +97,7 @@ class Fusion:
         """Fuse an event that is already aligned. ValueError if its source is not configured."""
         history, source = self.history, self.history.index.get(measurement.source)
         if source is None:
-            raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.plan.sources)}")
+            raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.params.sources)}")
         try:
             values = self._values(measurement)
         except Unusable as unusable:
@@ -126,7 +126,7 @@ class Fusion:
     def to_store(self) -> StoredState | None:
         """The newest state, for a hot start of the next run; None before alignment is complete."""
         head = self.history.head
-        if leads(head, self.plan):
+        if leads(head, self.params):
             head = leading(head)
         return stored_state(head, self.config) if head.stamps[PHASE] == RUNNING else None
 
@@ -134,7 +134,7 @@ class Fusion:
         """Counts of outcomes by source. An event counts with its latest outcome."""
         return {
             source: {outcome.name: int(self.history.counts[i, outcome]) for outcome in Outcome}
-            for i, source in enumerate(self.plan.sources)
+            for i, source in enumerate(self.params.sources)
         }
 
     def totals(self) -> dict[str, int]:
@@ -147,7 +147,7 @@ class Fusion:
         start = int(head.stamps[T_START])
         return {
             source: belief(head.memory[i], head.source_stamps[i], t_ns, start if start != NEVER else t_ns)
-            for i, source in enumerate(self.plan.sources)
+            for i, source in enumerate(self.params.sources)
         }
 
     def _values(self, measurement: Measurement) -> tuple[float, ...]:
@@ -163,7 +163,7 @@ class Fusion:
 
     def _published(self, state: FilterState) -> FilterState:
         """The state to publish: the leading hypothesis where a bank is sure of a stored heading, else the state itself."""
-        return leading(state) if leads(state, self.plan) else state
+        return leading(state) if leads(state, self.params) else state
 
     def _solution(self, state: FilterState, t_ns: int) -> Solution:
         """The solution that a filter state gives at an instant."""
@@ -174,9 +174,9 @@ class Fusion:
         published = solution_state(state, self.history.kernel)
         north, east, _ = published.sigma_position_n()
         mode = Mode.NOMINAL
-        if math.hypot(north, east) > self.plan.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
+        if math.hypot(north, east) > self.params.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
             mode = Mode.LOST
-        elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.plan.filter.position_timeout_s):
+        elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.params.filter.position_timeout_s):
             mode = Mode.DEAD_RECKONING
         return Solution(t_ns, mode, age, resets, published)
 
@@ -191,7 +191,7 @@ def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
 def solution_state(state: FilterState, kernel: AnyKernel) -> SolutionState:
     """A filter state after alignment, in north-east-down, for publication."""
     x, auxiliary = state.nominal, state.auxiliary
-    numbers = kernel.answer(x, state.covariance)
+    numbers = kernel.to_north_east_down(x, state.covariance)
     published, nominal = numbers[: COVARIANCE_N.start].tolist(), x.tolist()
     rate, force = auxiliary[RATE_B].tolist(), auxiliary[FORCE_B].tolist()
     gyro_bias, accel_bias = nominal[GYRO_BIAS_B], nominal[ACCEL_BIAS_B]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fusiond.events import Measurement
 from fusiond.filter.kernel.interpreted import keep, make_kernel
 from fusiond.filter.observations import IMU
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import ROW, Outcome, Rows
 from fusiond.filter.state import NEVER, FilterState
 from fusiond.filter.step import run_one
@@ -35,17 +35,17 @@ FORGET_EVERY = 256  # events; at most this many are run at once
 class History:
     """The events of the horizon and the filter state that they lead to."""
 
-    def __init__(self, plan: Plan, compiled: bool | None = None) -> None:
-        self.plan = plan
-        self.kernel = make_kernel(plan, compiled)
-        self.index = {source: i for i, source in enumerate(plan.sources)}
+    def __init__(self, params: Parameters, compiled: bool | None = None) -> None:
+        self.params = params
+        self.kernel = make_kernel(params, compiled)
+        self.index = {source: i for i, source in enumerate(params.sources)}
         self.rerun = 0  # rows run again because of a late event
         self.applied_ns = NEVER  # events up to here are applied; it depends on the received stamps alone
-        self.settled_ns = NEVER - plan.horizon_ns  # the horizon: an older event is TOO_OLD
-        self._head = FilterState(len(plan.sources), plan.size)
-        self._counts: NDArray[np.int64] = np.zeros((len(plan.sources), len(Outcome)), dtype=np.int64)
+        self.settled_ns = NEVER - params.horizon_ns  # the horizon: an older event is TOO_OLD
+        self._head = FilterState(len(params.sources), params.size)
+        self._counts: NDArray[np.int64] = np.zeros((len(params.sources), len(Outcome)), dtype=np.int64)
         # by source: an event makes the rows older than it by this due [ns]
-        self._lags = [0 if model == IMU else plan.imu_gap_ns for model in plan.models]
+        self._lags = [0 if model == IMU else params.imu_gap_ns for model in params.models]
         self._table: Rows = np.zeros(FIRST_ROWS, dtype=ROW)
         self._begin = self._end = 0  # the live part of the table
         self._applied = 0  # rows of the live part in the head; after a rewind, in the newest snapshot
@@ -95,7 +95,7 @@ class History:
             self._rewind(first_changed)
         reach_ns = t_ns - self._lags[source]
         if reach_ns > self.applied_ns:
-            self.applied_ns, self.settled_ns = reach_ns, reach_ns - self.plan.horizon_ns
+            self.applied_ns, self.settled_ns = reach_ns, reach_ns - self.params.horizon_ns
         self._until_forgetting -= 1
         if not self._until_forgetting:
             self._forget()
@@ -144,9 +144,9 @@ class History:
                 self._attach()
             elif self._applied == before:
                 rows = self._table[self._begin : self._end]
-                self._applied = run_one(self._head, rows, before, self._counts, self.plan)
+                self._applied = run_one(self._head, rows, before, self._counts, self.params)
                 memory = (kept.numbers, kept.whole, kept.applied)
-                kept.end = keep(self._head, rows, self._applied, self.plan, memory, kept.end)
+                kept.end = keep(self._head, rows, self._applied, self.params, memory, kept.end)
 
     def _make_room(self) -> None:
         """Move the live rows to the front of the table, or of a larger one if they fill half of it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
@@ -18,28 +18,28 @@ from fusiond.filter.state import (
 )
 
 DEGREE = math.degrees(1.0)
-MILLISECOND = 1000.0
+MS_PER_S = 1000.0
 
 
-def calibrations(plan: Plan, state: FilterState) -> dict[str, tuple[float, float]]:
+def calibrations(params: Parameters, state: FilterState) -> dict[str, tuple[float, float]]:
     """Value and sigma of every calibration that is learnt, by a name that ends in its unit; a scale has none. Each is what
     it is more than configured."""
     found = {}
-    for place, name, unit in _names(plan):
-        if place < state.size and plan.calibration_variances[place - CALIBRATIONS] > 0:
+    for place, name, unit in _names(params):
+        if place < state.size and params.calibration_variances[place - CALIBRATIONS] > 0:
             variance = max(0.0, float(state.covariance[place, place]))
             found[name] = float(state.nominal[place + 1]) * unit, math.sqrt(variance) * unit
     return found
 
 
-def _names(plan: Plan) -> Iterator[tuple[int, str, float]]:
+def _names(params: Parameters) -> Iterator[tuple[int, str, float]]:
     """Error state, name and factor to the unit in it."""
-    for group, name in enumerate(plan.scales):
+    for group, name in enumerate(params.scales):
         yield SCALE.start if group == 0 else FURTHER_SCALES_ERROR.start + group - 1, name, 1.0
     yield MOUNT_ERROR.start, "mount_pitch_deg", DEGREE
     yield MOUNT_ERROR.start + 1, "mount_yaw_deg", DEGREE
     for axis, name in enumerate(("forward", "right", "down")):
         yield ANTENNA_ERROR.start + axis, f"lever_arm_{name}_m", 1.0
-    yield DELAYS_ERROR.start, "delay_ms", MILLISECOND
-    yield DELAYS_ERROR.start + 1, "velocity_delay_ms", MILLISECOND
+    yield DELAYS_ERROR.start, "delay_ms", MS_PER_S
+    yield DELAYS_ERROR.start + 1, "velocity_delay_ms", MS_PER_S
     yield HEIGHT_OFFSET_ERROR.start, "height_offset_m", 1.0

@@ -24,7 +24,7 @@ from fusiond.filter.motion_constraints import (
 )
 from fusiond.filter.observations import WHEEL_SPEED, non_holonomic, observe, wheel_speed
 from fusiond.filter.observations.model import Observation, with_rate_noise
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS
 from fusiond.filter.state import (
     ATTITUDE,
@@ -74,19 +74,27 @@ def weigh(state: FilterState, i: int, seen: Observation, factor: float, spread: 
 
 
 @compiled
-def take(
-    state: FilterState, i: int, hypothesis: FilterState, seen: Observation, factor: float, plan: Plan, weighed: bool = True
+def fuse(
+    state: FilterState,
+    i: int,
+    hypothesis: FilterState,
+    seen: Observation,
+    factor: float,
+    params: Parameters,
+    weighed: bool = True,
 ) -> None:
     """Weigh a hypothesis by an observation, unless it was by another, and update it."""
     across, spread = np.empty((3, state.size)), np.empty((3, 3))
     project(hypothesis, seen, across, spread)
     if weighed:
         weigh(state, i, seen, factor, spread)
-    update_projected(hypothesis, seen, plan.gates[seen.m], factor, True, CLUTTER, across, spread)
+    update_projected(hypothesis, seen, params.gates[seen.m], factor, True, CLUTTER, across, spread)
 
 
 @compiled
-def measure(state: FilterState, i: int, model: int, values: Vector, parameter: Vector, factor: float, plan: Plan) -> None:
+def fuse_measurement(
+    state: FilterState, i: int, model: int, values: Vector, parameter: Vector, factor: float, params: Parameters
+) -> None:
     """Take one measurement into a hypothesis. A wheel weighs it by the direction that the hypothesis says it turns in."""
     hypothesis = state.hypothesis(i)
     seen = Observation(state.size)
@@ -98,35 +106,35 @@ def measure(state: FilterState, i: int, model: int, values: Vector, parameter: V
         weigh(state, i, seen, factor, spread)
     if observe(hypothesis, model, values, parameter, seen):
         share_noise(hypothesis, seen, parameter)
-        take(state, i, hypothesis, seen, factor, plan, model != WHEEL_SPEED)
+        fuse(state, i, hypothesis, seen, factor, params, model != WHEEL_SPEED)
 
 
 @compiled
-def constrain(state: FilterState, plan: Plan) -> None:
+def constrain(state: FilterState, params: Parameters) -> None:
     """Apply the motion constraints that are due to every hypothesis; one in which the vehicle goes sideways
     loses weight."""
-    still, rolling = constraints_due(state, plan)
+    still, rolling = constraints_due(state, params)
     if not (still or rolling):
         return
     seen = Observation(state.size)
     for i in range(HYPOTHESES):
         if still and state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
-            observe_constraint(hypothesis, ZERO_VELOCITY, plan, seen)
+            observe_constraint(hypothesis, ZERO_VELOCITY, params, seen)
             with_rate_noise(hypothesis, seen)
-            take(state, i, hypothesis, seen, plan.zero_velocity_factor, plan)
-            observe_constraint(hypothesis, ZERO_ROTATION, plan, seen)
+            fuse(state, i, hypothesis, seen, params.zero_velocity_factor, params)
+            observe_constraint(hypothesis, ZERO_ROTATION, params, seen)
             with_rate_noise(hypothesis, seen)
-            take(state, i, hypothesis, seen, 1.0, plan)
+            fuse(state, i, hypothesis, seen, 1.0, params)
     if rolling and not still:
-        _roll(state, plan)
+        _roll(state, params)
     normalise(state)
 
 
 @compiled
-def _roll(state: FilterState, plan: Plan) -> None:
+def _roll(state: FilterState, params: Parameters) -> None:
     """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction."""
-    parameter = plan.constraints[NON_HOLONOMIC]
+    parameter = params.constraints[NON_HOLONOMIC]
     seen = Observation(state.size)
     fastest = 0.0
     for i in range(HYPOTHESES):
@@ -140,7 +148,7 @@ def _roll(state: FilterState, plan: Plan) -> None:
             hypothesis = state.hypothesis(i)
             non_holonomic.observe_at_any_speed(hypothesis, parameter, seen)
             with_rate_noise(hypothesis, seen)
-            take(state, i, hypothesis, seen, 1.0, plan)
+            fuse(state, i, hypothesis, seen, 1.0, params)
 
 
 @compiled
@@ -156,7 +164,7 @@ def normalise(state: FilterState) -> None:
 
 
 @compiled
-def collapse_if_close(state: FilterState, plan: Plan) -> None:
+def collapse_if_close(state: FilterState, params: Parameters) -> None:
     """Normalise, and collapse the bank where the headings are close together and hardly any is far off: the filter then
     runs."""
     normalise(state)
@@ -185,7 +193,7 @@ def collapse_if_close(state: FilterState, plan: Plan) -> None:
             spread += state.bank[i, 0] * (own + (turns[i] - mean) * (turns[i] - mean))
             if abs(turns[i]) > FAR:
                 doubt += state.bank[i, 0]
-    if spread <= plan.heading_variance and doubt <= DOUBT:
+    if spread <= params.heading_variance and doubt <= DOUBT:
         _collapse(state, best, errors)
 
 

@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 from fusiond.filter.observations.model import LEVER_ARM_B
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.state import (
     CHOOSING,
     FIX_E,
@@ -65,32 +65,32 @@ class Heading(NamedTuple):
     weight: float
 
 
-def recall(state: FilterState, plan: Plan) -> tuple[StoredState | None, Verdict]:
+def recall(state: FilterState, params: Parameters) -> tuple[StoredState | None, Verdict]:
     """The stored state, if it is of use at the state's instant: at the first start only, and not beyond its age."""
-    stored = plan.stored
+    stored = params.stored
     if stored is None or state.stamps[RESETS]:
         return None, Verdict.NONE
     age_ns = int(state.stamps[T]) - stored.t_ns
     if age_ns < 0:
         return None, Verdict.FUTURE
-    return (None, Verdict.STALE) if age_ns > plan.max_stored_age_ns else (stored, Verdict.OTHERWISE_KNOWN)
+    return (None, Verdict.STALE) if age_ns > params.max_stored_age_ns else (stored, Verdict.OTHERWISE_KNOWN)
 
 
-def aged(stored: StoredState, state: FilterState, plan: Plan) -> tuple[list[float], list[float]]:
+def aged(stored: StoredState, state: FilterState, params: Parameters) -> tuple[list[float], list[float]]:
     """Values of gyro bias, accelerometer bias and calibrations, and their variances now: grown by the random walks, and
     never larger than those of a cold start. What is frozen stays at zero."""
-    age, noise = (int(state.stamps[T]) - stored.t_ns) * 1e-9, plan.noise
+    age, noise = (int(state.stamps[T]) - stored.t_ns) * 1e-9, params.noise
     values = [*stored.gyro_bias, *stored.accel_bias, *stored.calibrations]
     kept = [*stored.gyro_bias_variance, *stored.accel_bias_variance, *stored.calibration_variances]
     walks = [noise.gyro_bias] * 3 + [noise.accel_bias] * 3 + list(noise.calibrations)
-    cold = [square(plan.imu.gyro_bias_sigma)] * 3 + [square(plan.imu.accel_bias_sigma)] * 3
-    cold += plan.calibration_variances.tolist()
+    cold = [square(params.imu.gyro_bias_sigma)] * 3 + [square(params.imu.accel_bias_sigma)] * 3
+    cold += params.calibration_variances.tolist()
     variances = [min(old + walk * age, most) for old, walk, most in zip(kept, walks, cold, strict=True)]
     return [value if most > 0 else 0.0 for value, most in zip(values, cold, strict=True)], variances
 
 
 def heading(
-    stored: StoredState, state: FilterState, source: int, level: tuple[float, float] | None, plan: Plan
+    stored: StoredState, state: FilterState, source: int, level: tuple[float, float] | None, params: Parameters
 ) -> tuple[Heading | None, Verdict]:
     """What the stored heading is worth, where the last fix came by `source`; `level` is roll and pitch now [rad] of a
     vehicle at rest, None in motion."""
@@ -101,12 +101,12 @@ def heading(
         return None, Verdict.IN_MOTION
     reach = 0.0
     if not stored.at_rest:
-        reach = plan.filter.v_max_mps * age
+        reach = params.filter.v_max_mps * age
     elif level is None:
         reach = ROLLED
     spread = stored.position_variance + float(state.auxiliary[FIX_VARIANCE][0])
-    if max(0.0, _distance(stored, state.auxiliary[FIX_E], plan.parameters[source][LEVER_ARM_B]) - reach) > math.sqrt(
-        plan.gates[2] * spread
+    if max(0.0, _distance(stored, state.auxiliary[FIX_E], params.model_parameters[source][LEVER_ARM_B]) - reach) > math.sqrt(
+        params.gates[2] * spread
     ):
         return None, Verdict.MOVED
     agrees = level is not None and max(abs(level[0] - stored.roll), abs(level[1] - stored.pitch)) <= LEVEL_AGREES
@@ -115,7 +115,7 @@ def heading(
     return Heading(stored.yaw, max(sigma, DOUBTED_SIGMA), DOUBTED_WEIGHT), Verdict.DOUBTED
 
 
-def leads(state: FilterState, plan: Plan) -> bool:
+def leads(state: FilterState, params: Parameters) -> bool:
     """Whether a bank is so sure of the stored heading that its state is published."""
     if state.stamps[PHASE] != CHOOSING or state.stamps[HOT_START] != Verdict.USED:
         return False

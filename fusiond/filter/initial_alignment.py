@@ -25,7 +25,7 @@ from fusiond.filter.observations import (
     zero_velocity,
 )
 from fusiond.filter.observations.model import LEVER_ARM_B
-from fusiond.filter.parameters import SECOND, Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Row
 from fusiond.filter.source_health import arrive
 from fusiond.filter.state import (
@@ -79,6 +79,7 @@ from fusiond.maths.portable import atan2, sin_cos, square
 from fusiond.maths.rotation import matrix, matrix_from_euler, product, quaternion
 from fusiond.maths.typed import Array, compiled
 from fusiond.maths.wgs84 import geodetic_trig, mat_ne, mat_ne_from_trig
+from fusiond.units import SECOND
 
 FIX_FRESH_NS = 2 * SECOND  # a fix older than this does not start the filter
 MIN_WINDOW_NS = SECOND  # the GNSS velocities that give the vehicle's acceleration lie at least so far apart
@@ -98,58 +99,58 @@ def begin(state: FilterState) -> None:
     state.source_stamps[:] = NEVER
 
 
-def gather(state: FilterState, row: Row, plan: Plan) -> None:
+def gather(state: FilterState, row: Row, params: Parameters) -> None:
     """Take in one event while aligning, and start the filter if it completes what is needed."""
     stamps, auxiliary, values = state.stamps, state.auxiliary, row["values"]
     t_ns, source = int(row["t_ns"]), int(row["source"])
-    model = plan.models[source]
+    model = params.models[source]
     stamps[T] = t_ns
     if model == GNSS_POSITION:
         auxiliary[FIX_E] = values[gnss_position.PLACE_E]
         auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
         stamps[T_FIX] = t_ns
-        _start_by_position(state, source, plan)
+        _start_by_position(state, source, params)
     elif model == GNSS_VELOCITY:
-        _gather_velocity(state, source, values, plan)
+        _gather_velocity(state, source, values, params)
     else:
-        gather_motion(state, row, plan)
+        gather_motion(state, row, params)
 
 
 @compiled
-def gather_motion(state: FilterState, row: Row, plan: Plan) -> None:
+def gather_motion(state: FilterState, row: Row, params: Parameters) -> None:
     """Take in one event that starts nothing: an inertial sample into the means, a wheel's speed for the motion detector."""
     stamps, a, values = state.stamps, state.auxiliary, row["values"]
     t_ns, source = int(row["t_ns"]), int(row["source"])
     stamps[T] = t_ns
-    if plan.models[source] == WHEEL_SPEED:
+    if params.models[source] == WHEEL_SPEED:
         state.memory[source, LAST_SPEED] = values[wheel_speed.SPEED]
-    if plan.models[source] != IMU:
+    if params.models[source] != IMU:
         return
     arrive(state.memory[source], state.source_stamps[source], values, t_ns)
     if stamps[T_IMU] != NEVER:
-        watch(state, values[0:3], values[3:6], (t_ns - stamps[T_IMU]) * 1e-9, plan)
+        watch(state, values[0:3], values[3:6], (t_ns - stamps[T_IMU]) * 1e-9, params)
     stamps[T_IMU] = t_ns
     for i in range(3):
         a[HELD_FORCE_B.start + i] = a[FORCE_B.start + i] = values[i]
         a[HELD_RATE_B.start + i] = a[RATE_B.start + i] = values[3 + i]
-    still = stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= plan.still_after_ns
-    if still and not _gnss_speed(state) >= plan.course_speed:  # a quiet drive without wheels
+    still = stamps[T_STILL] != NEVER and t_ns - stamps[T_STILL] >= params.still_after_ns
+    if still and not _gnss_speed(state) >= params.course_speed:  # a quiet drive without wheels
         a[REST_RATE_B] = a[MEAN_RATE_B]
         stamps[T_REST] = t_ns
 
 
-def _start_by_position(state: FilterState, source: int, plan: Plan) -> None:
+def _start_by_position(state: FilterState, source: int, params: Parameters) -> None:
     """Start at rest; or, where no GNSS velocity is to be had, in a motion that only its bound is known of."""
     speed = _gnss_speed(state)
-    if not _leveled(state) or speed >= plan.course_speed:
+    if not _leveled(state) or speed >= params.course_speed:
         return
-    if _rests(state, plan):
-        _start(state, source, None, plan.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, plan)
-    elif _given(state, plan) or not plan.velocities:
-        _start(state, source, None, square(plan.filter.v_max_mps / 3), None, plan)
+    if _rests(state, params):
+        _start(state, source, None, params.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, params)
+    elif _given(state, params) or not params.velocities:
+        _start(state, source, None, square(params.filter.v_max_mps / 3), None, params)
 
 
-def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan) -> None:
+def _gather_velocity(state: FilterState, source: int, values: Array, params: Parameters) -> None:
     stamps, auxiliary = state.stamps, state.auxiliary
     velocity_n = values[gnss_velocity.VELOCITY_N]
     window = stamps[T] - stamps[T_FIRST_VELOCITY]
@@ -162,19 +163,19 @@ def _gather_velocity(state: FilterState, source: int, values: Array, plan: Plan)
     if window < MIN_WINDOW_NS or not fresh or not _leveled(state):
         return
     variance, course = values[gnss_velocity.VARIANCE], None
-    if speed >= plan.course_speed:
+    if speed >= params.course_speed:
         sigma = math.sqrt(variance / square(speed) + square(COURSE_SIGMA))
         course = atan2(velocity_n[1], velocity_n[0]), sigma
     elif stamps[T_STILL] != NEVER:
         return  # the next position starts it
-    _start(state, source, velocity_n, variance, course, plan)
+    _start(state, source, velocity_n, variance, course, params)
 
 
-def _given(state: FilterState, plan: Plan) -> tuple[float, float] | None:
+def _given(state: FilterState, params: Parameters) -> tuple[float, float] | None:
     """The configured heading and its sigma [rad]: of the first start, and of later ones where there is no newer one."""
-    if plan.filter.heading_deg is None or (state.stamps[RESETS] and plan.velocities):
+    if params.filter.heading_deg is None or (state.stamps[RESETS] and params.velocities):
         return None
-    return math.radians(plan.filter.heading_deg), math.radians(plan.filter.heading_sigma_deg)
+    return math.radians(params.filter.heading_deg), math.radians(params.filter.heading_sigma_deg)
 
 
 @compiled
@@ -187,9 +188,9 @@ def _gnss_speed(state: FilterState) -> float:
     return math.sqrt(square(north) + square(east))
 
 
-def _rests(state: FilterState, plan: Plan) -> bool:
+def _rests(state: FilterState, params: Parameters) -> bool:
     """Whether more than a quiet inertial sensor says that the vehicle stands."""
-    return bool(state.stamps[T_STILL] != NEVER) and (bool(plan.wheels) or not math.isnan(_gnss_speed(state)))
+    return bool(state.stamps[T_STILL] != NEVER) and (bool(params.wheels) or not math.isnan(_gnss_speed(state)))
 
 
 def _leveled(state: FilterState) -> bool:
@@ -202,22 +203,22 @@ def _start(
     measured_n: Array | None,
     variance: float,
     heading: tuple[float, float] | None,
-    plan: Plan,
+    params: Parameters,
 ) -> None:
     """Start from what was gathered: with a velocity (3,) [m/s], or None where it was not measured, and its variance; with
     a heading and sigma [rad], a given one before a measured one; and where there is none, with a bank of hypotheses all
     round, and a stored one among them."""
-    heading = _given(state, plan) or heading
-    stored, verdict = hot_start.recall(state, plan)
-    first = _first_variances(state, stored, plan)
+    heading = _given(state, params) or heading
+    stored, verdict = hot_start.recall(state, params)
+    first = _first_variances(state, stored, params)
     if heading is not None:
-        _place(state, source, measured_n, variance, heading, first, plan)
+        _place(state, source, measured_n, variance, heading, first, params)
         state.stamps[PHASE] = RUNNING
     else:
         kept = None
         if stored is not None:
-            level = _level(state, None, 0.0) if measured_n is None and _rests(state, plan) else None
-            kept, verdict = hot_start.heading(stored, state, source, level, plan)
+            level = _level(state, None, 0.0) if measured_n is None and _rests(state, params) else None
+            kept, verdict = hot_start.heading(stored, state, source, level, params)
         state.bank[:] = 0.0
         headings = [(2 * math.pi * i / ALL_ROUND, BANK_SIGMA) for i in range(ALL_ROUND)]
         state.bank[:ALL_ROUND, 0] = (1.0 - (kept.weight if kept else 0.0)) / ALL_ROUND
@@ -226,35 +227,35 @@ def _start(
             state.bank[STORED, 0] = kept.weight
         for i, turned in enumerate(headings):
             state.hypothesis(i).nominal[:] = state.nominal  # biases and calibrations of before
-            _place(state.hypothesis(i), source, measured_n, variance, turned, first, plan)
+            _place(state.hypothesis(i), source, measured_n, variance, turned, first, params)
         state.stamps[PHASE] = CHOOSING
     if verdict:
         state.stamps[HOT_START] = verdict
     state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
 
 
-def _first_variances(state: FilterState, stored: StoredState | None, plan: Plan) -> Array:
+def _first_variances(state: FilterState, stored: StoredState | None, params: Parameters) -> Array:
     """Put the first biases and calibrations into the state: stored ones, and the gyro bias of a standstill where that is
     better. Returns the variances (n - 9,) of the error states from the gyro bias on."""
     stamps, x = state.stamps, state.nominal
     rest = stamps[T_REST] != NEVER and stamps[T] - stamps[T_REST] <= REST_FRESH_NS
-    gyro = square(min(REST_BIAS_SIGMA, plan.imu.gyro_bias_sigma) if rest else plan.imu.gyro_bias_sigma)
-    variances = [gyro] * 3 + [square(plan.imu.accel_bias_sigma)] * 3 + plan.calibration_variances.tolist()
+    gyro = square(min(REST_BIAS_SIGMA, params.imu.gyro_bias_sigma) if rest else params.imu.gyro_bias_sigma)
+    variances = [gyro] * 3 + [square(params.imu.accel_bias_sigma)] * 3 + params.calibration_variances.tolist()
     measured = state.auxiliary[REST_RATE_B].copy() if rest else x[GYRO_BIAS_B].copy()
     if stored is not None:
-        x[GYRO_BIAS_B.start : state.size + 1], variances = hot_start.aged(stored, state, plan)
-    trusted = stored is not None and not _contradicted(state, variances, plan)
+        x[GYRO_BIAS_B.start : state.size + 1], variances = hot_start.aged(stored, state, params)
+    trusted = stored is not None and not _contradicted(state, variances, params)
     for a in range(3):
         if not trusted or variances[a] > gyro:
             x[GYRO_BIAS_B.start + a], variances[a] = measured[a], gyro
     return np.array(variances)
 
 
-def _contradicted(state: FilterState, variances: list[float], plan: Plan) -> bool:
+def _contradicted(state: FilterState, variances: list[float], params: Parameters) -> bool:
     """Whether the gyro at rest reads something else than the bias in the state, whose variances come first."""
     if state.stamps[T_STILL] == NEVER:
         return False
-    noise = square(REST_BIAS_SIGMA) + plan.noise.gyro / MEAN_TIME
+    noise = square(REST_BIAS_SIGMA) + params.noise.gyro / MEAN_TIME
     off = state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
     return any(square(off[a]) > 9 * (variances[a] + noise) for a in range(3))
 
@@ -266,7 +267,7 @@ def _place(
     variance: float,
     heading: tuple[float, float],
     first: Array,
-    plan: Plan,
+    params: Parameters,
 ) -> None:
     """Make the first state of one heading; `first` are the variances of the error states from the gyro bias on."""
     stamps, auxiliary, x = state.stamps, state.auxiliary, state.nominal
@@ -275,12 +276,12 @@ def _place(
     mat_nb = matrix_from_euler(*_level(state, measured_n, yaw), yaw)
     velocity_n = np.zeros(3) if measured_n is None else measured_n
     since = (stamps[T] - stamps[T_FIX]) * 1e-9
-    lever_b = plan.parameters[source][LEVER_ARM_B]
+    lever_b = params.model_parameters[source][LEVER_ARM_B]
     x[POSITION_E] = auxiliary[FIX_E] + product(to_n.T, velocity_n * since - product(mat_nb, lever_b))
     x[VELOCITY_E] = product(to_n.T, velocity_n)
     x[QUATERNION_EB] = quaternion(product(to_n.T, mat_nb))
     horizontal, vertical = auxiliary[FIX_VARIANCE]
-    level = square(math.radians(plan.filter.level_sigma_deg))
+    level = square(math.radians(params.filter.level_sigma_deg))
     covariance = state.covariance
     covariance[:] = 0.0
     aged = variance * since * since

@@ -20,7 +20,7 @@ from fusiond.filter.observations.model import (
     Observation,
     with_rate_noise,
 )
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Row
 from fusiond.filter.state import (
     HEIGHT_OFFSET,
@@ -83,11 +83,11 @@ def correlation_of(model: int, values: Vector, parameter: Vector) -> float:
 
 
 @compiled
-def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
+def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
-    model, values = plan.models[source], row["values"]
-    parameter, memory, stamps = plan.parameters[source], state.memory[source], state.source_stamps[source]
+    model, values = params.models[source], row["values"]
+    parameter, memory, stamps = params.model_parameters[source], state.memory[source], state.source_stamps[source]
     elapsed = source_health.since_last(stamps, t_ns)
     same = source_health.arrive(memory, stamps, values, t_ns)
     remember(memory, model, values)
@@ -111,7 +111,7 @@ def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 
         stamps[T_BACK] = t_ns
         source_health.begin(memory)
     companion = int(parameter[COMPANION])
-    doubtful = disputed(state, source if model == GNSS_VELOCITY else companion, plan)
+    doubtful = disputed(state, source if model == GNSS_VELOCITY else companion, params)
     if not doubtful:
         if source_health.is_due(stamps, t_ns, correlation_of(model, values, parameter)):
             whitened = np.empty(3)
@@ -121,13 +121,13 @@ def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 
         source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = source_health.is_trusted(memory) and (companion < 0 or source_health.is_trusted(state.memory[companion]))
     if model == WHEEL_SPEED and trusted:
-        trusted = not carried(state, memory[LAST_SPEED], plan)
+        trusted = not carried(state, memory[LAST_SPEED], params)
     noisy = source_health.noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = learnt[a] * noisy
-    ratio, fused = update_projected(state, seen, plan.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
+    ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
     row["ratio"] = memory[LAST_RATIO] = ratio
-    if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, plan):
+    if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, params):
         _reset(state, source, seen, int(parameter[RESETS]))
         source_health.begin(memory)
         fused = True
@@ -142,22 +142,24 @@ def measure(state: FilterState, row: Row, plan: Plan) -> bool:  # noqa: PLR0915 
 
 
 @compiled
-def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, plan: Plan) -> bool:
+def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, params: Parameters) -> bool:
     """Whether a GNSS source has been rejected for long, with the same error all the time, so that the state is likelier
     at fault: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
     and much later for a velocity, or a position whose velocity is not trusted, because the rest of the vehicle then
     contradicts the receiver's motion, as in a slowly growing spoof."""
     memory, stamps = state.memory[source], state.source_stamps[source]
-    off = source_health.moved(memory, seen.innovation, seen.variance, seen.m, plan.gates[seen.m])
+    off = source_health.moved(memory, seen.innovation, seen.variance, seen.m, params.gates[seen.m])
     if off or stamps[T_SAME_ERROR] == NEVER or t_ns - stamps[T_LAST] > BREAK_NS:
         stamps[T_SAME_ERROR] = t_ns
         return False
-    wait = plan.gnss_reset_ns
-    companion = int(plan.parameters[source, COMPANION])
+    wait = params.gnss_reset_ns
+    companion = int(params.model_parameters[source, COMPANION])
     returns = stamps[T_FUSED] == NEVER or stamps[T_SAME_ERROR] - stamps[T_BACK] <= OUTAGE_NS
-    if (returns and memory[LAST_RATIO] <= NEAR) or is_carried(state, plan):
-        wait = plan.gnss_return_ns
-    elif plan.models[source] == GNSS_VELOCITY or (companion >= 0 and not source_health.is_trusted(state.memory[companion])):
+    if (returns and memory[LAST_RATIO] <= NEAR) or is_carried(state, params):
+        wait = params.gnss_return_ns
+    elif params.models[source] == GNSS_VELOCITY or (
+        companion >= 0 and not source_health.is_trusted(state.memory[companion])
+    ):
         wait = SUSPECT * wait
     return t_ns - stamps[T_SAME_ERROR] >= wait
 

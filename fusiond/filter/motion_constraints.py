@@ -5,7 +5,7 @@ from __future__ import annotations
 from fusiond.filter.measurement_update import update
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
 from fusiond.filter.observations.model import Observation, with_rate_noise
-from fusiond.filter.parameters import SECOND, Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import is_trusted
 from fusiond.filter.state import (
     CONSTRAINT_FUSED,
@@ -29,6 +29,7 @@ from fusiond.filter.state import (
 )
 from fusiond.maths.portable import exp, square
 from fusiond.maths.typed import Vector3, compiled
+from fusiond.units import SECOND
 
 MEAN_TIME = 0.5  # s, time constant of the exponential means
 OWN_SCATTER = 3 * 1.5 * 1.5  # of white noise of unit density in three axes, and a margin of a half
@@ -37,11 +38,11 @@ MEAN_FILLED = 0.8  # weight from which a mean is used: 0.8 s after its begin
 GNSS_FRESH_NS = 2 * SECOND  # a GNSS velocity older than this says nothing of being carried
 CARRIED_SPEED = 1.0  # m/s: slower than this no vehicle is called carried
 WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer says nothing of standing
-NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2  # rows of Plan.constraints
+NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2  # rows of Parameters.constraints
 
 
 @compiled
-def watch(state: FilterState, force_b: Vector3, rate_b: Vector3, dt: float, plan: Plan) -> None:
+def watch(state: FilterState, force_b: Vector3, rate_b: Vector3, dt: float, params: Parameters) -> None:
     """Take one inertial sample, `dt` [s] after the last, into the means and scatters, and decide whether the vehicle
     stands: since when is in stamps[T_STILL]."""
     auxiliary = state.auxiliary
@@ -57,7 +58,7 @@ def watch(state: FilterState, force_b: Vector3, rate_b: Vector3, dt: float, plan
     off = rate_b - auxiliary[MEAN_RATE_B]
     auxiliary[MEAN_RATE_B] += step * off
     auxiliary[SCATTER_RATE] = _scatter(auxiliary[SCATTER_RATE], off, step)
-    if not stands(state, plan):
+    if not stands(state, params):
         state.stamps[T_STILL] = NEVER
     elif state.stamps[T_STILL] == NEVER:
         state.stamps[T_STILL] = state.stamps[T]
@@ -70,11 +71,11 @@ def _scatter(before: float, off: Vector3, step: float) -> float:
 
 
 @compiled
-def carried(state: FilterState, wheel_speed: float, plan: Plan) -> bool:
+def carried(state: FilterState, wheel_speed: float, params: Parameters) -> bool:
     """Whether a wheel at rest says nothing, because the vehicle is carried or towed: GNSS sees it move."""
-    if not abs(wheel_speed) <= plan.still_wheel:
+    if not abs(wheel_speed) <= params.still_wheel:
         return False
-    for i in plan.velocities:
+    for i in params.velocities:
         fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS
         if fresh and state.memory[i, LOWEST_SPEED] > CARRIED_SPEED and is_trusted(state.memory[i]):
             return True
@@ -82,86 +83,86 @@ def carried(state: FilterState, wheel_speed: float, plan: Plan) -> bool:
 
 
 @compiled
-def rests(state: FilterState, plan: Plan) -> bool:
+def rests(state: FilterState, params: Parameters) -> bool:
     """Whether every wheel that was heard lately is at rest, and one was."""
     heard = False
-    for i in plan.wheels:
+    for i in params.wheels:
         if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS:
             heard = True
-            if not abs(state.memory[i, LAST_SPEED]) <= plan.still_wheel:
+            if not abs(state.memory[i, LAST_SPEED]) <= params.still_wheel:
                 return False
     return heard
 
 
 @compiled
-def is_carried(state: FilterState, plan: Plan) -> bool:
+def is_carried(state: FilterState, params: Parameters) -> bool:
     """Whether all wheels rest while GNSS sees the vehicle move: its body then goes where it is carried."""
-    return rests(state, plan) and carried(state, 0.0, plan)
+    return rests(state, params) and carried(state, 0.0, params)
 
 
 @compiled
-def disputed(state: FilterState, velocity: int, plan: Plan) -> bool:
+def disputed(state: FilterState, velocity: int, params: Parameters) -> bool:
     """Whether all wheels rest while a receiver, by its source `velocity` (-1: none), moves: either it is wrong, or the
     vehicle begins to be carried. Nobody is to be blamed for that."""
-    return velocity >= 0 and state.memory[velocity, LOWEST_SPEED] > 0.0 and rests(state, plan)
+    return velocity >= 0 and state.memory[velocity, LOWEST_SPEED] > 0.0 and rests(state, params)
 
 
 @compiled
-def stands(state: FilterState, plan: Plan) -> bool:
+def stands(state: FilterState, params: Parameters) -> bool:
     """Whether this instant looks like standstill: a quiet IMU, and every fresh wheel at zero (at least one, if any is
     configured)."""
     auxiliary = state.auxiliary
-    if not plan.standstill or auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
+    if not params.standstill or auxiliary[MEAN_WEIGHT] < MEAN_FILLED:
         return False
-    wheeled = len(plan.wheels) > 0
-    interval = state.memory[plan.imu_source, INTERVAL] if wheeled else 0.0
+    wheeled = len(params.wheels) > 0
+    interval = state.memory[params.imu_source, INTERVAL] if wheeled else 0.0
     own = OWN_SCATTER / interval if interval > 0 else 0.0  # wheels at zero say what the inertial sensor's noise hides
-    if auxiliary[SCATTER_FORCE] > max(square(plan.still_accel), own * plan.noise.accel):
+    if auxiliary[SCATTER_FORCE] > max(square(params.still_accel), own * params.noise.accel):
         return False
-    if auxiliary[SCATTER_RATE] > max(square(plan.still_gyro), own * plan.noise.gyro):
+    if auxiliary[SCATTER_RATE] > max(square(params.still_gyro), own * params.noise.gyro):
         return False
-    return (not wheeled or rests(state, plan)) and not carried(state, 0.0, plan)
+    return (not wheeled or rests(state, params)) and not carried(state, 0.0, params)
 
 
 @compiled
-def constrain(state: FilterState, plan: Plan) -> None:
+def constrain(state: FilterState, params: Parameters) -> None:
     """Apply the constraints that hold now, if the last round is an interval ago."""
-    still, rolling = constraints_due(state, plan)
-    if still and _apply(state, ZERO_VELOCITY, plan, plan.zero_velocity_factor):  # rejected: it is a quiet drive
-        _apply(state, ZERO_ROTATION, plan, 1.0)
+    still, rolling = constraints_due(state, params)
+    if still and _apply(state, ZERO_VELOCITY, params, params.zero_velocity_factor):  # rejected: it is a quiet drive
+        _apply(state, ZERO_ROTATION, params, 1.0)
     elif rolling:
-        _apply(state, NON_HOLONOMIC, plan, 1.0)
+        _apply(state, NON_HOLONOMIC, params, 1.0)
 
 
 @compiled
-def constraints_due(state: FilterState, plan: Plan) -> tuple[bool, bool]:
+def constraints_due(state: FilterState, params: Parameters) -> tuple[bool, bool]:
     """Whether the vehicle stands, and whether its wheels keep it from going sideways, if it is time to look."""
     now = state.stamps[T]
-    if now - state.stamps[T_CONSTRAINT] < plan.constraint_interval_ns:
+    if now - state.stamps[T_CONSTRAINT] < params.constraint_interval_ns:
         return False, False
     state.stamps[T_CONSTRAINT] = now
-    still = state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= plan.still_after_ns
-    return still, plan.non_holonomic and not is_carried(state, plan)
+    still = state.stamps[T_STILL] != NEVER and now - state.stamps[T_STILL] >= params.still_after_ns
+    return still, params.non_holonomic and not is_carried(state, params)
 
 
 @compiled
-def observe_constraint(state: FilterState, which: int, plan: Plan, seen: Observation) -> bool:
+def observe_constraint(state: FilterState, which: int, params: Parameters, seen: Observation) -> bool:
     """One constraint as an observation; False where it does not hold now."""
     if which == ZERO_VELOCITY:
-        return zero_velocity.observe(state, plan.constraints[which], plan.constraints[which], seen)
+        return zero_velocity.observe(state, params.constraints[which], params.constraints[which], seen)
     if which == ZERO_ROTATION:
-        return zero_rotation.observe(state, plan.constraints[which], plan.constraints[which], seen)
-    return non_holonomic.observe(state, plan.constraints[which], plan.constraints[which], seen)
+        return zero_rotation.observe(state, params.constraints[which], params.constraints[which], seen)
+    return non_holonomic.observe(state, params.constraints[which], params.constraints[which], seen)
 
 
 @compiled
-def _apply(state: FilterState, which: int, plan: Plan, factor: float) -> bool:
+def _apply(state: FilterState, which: int, params: Parameters, factor: float) -> bool:
     """Fuse one constraint; whether it passed the gate."""
     seen = Observation(state.size)
-    if not observe_constraint(state, which, plan, seen):
+    if not observe_constraint(state, which, params, seen):
         return False
     with_rate_noise(state, seen)
-    ratio, fused = update(state, seen, plan.gates[seen.m], factor)
+    ratio, fused = update(state, seen, params.gates[seen.m], factor)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     if fused:
         state.stamps[CONSTRAINT_FUSED.start + which] += 1

@@ -9,22 +9,22 @@ import numpy as np
 
 from fusiond.filter.state import ATTITUDE, POSITION, POSITION_E, QUATERNION_EB, VELOCITY, VELOCITY_E
 from fusiond.maths.rotation import matrix, matrix_product, quaternion, times
-from fusiond.maths.typed import Answer, Covariance, Vector, compiled
+from fusiond.maths.typed import Covariance, StateN, Vector, compiled
 from fusiond.maths.wgs84 import geodetic, mat_ne
 
-# Slices of what `answer` returns
+# Slices of what `to_north_east_down` returns
 GEODETIC = slice(0, 3)  # latitude, longitude [rad], height [m]
 VELOCITY_N = slice(3, 6)  # m/s
 QUATERNION_NB = slice(6, 10)  # w >= 0
 COVARIANCE_N = slice(10, 91)  # (9, 9): position, velocity, attitude, each north, east, down
-ANSWER_SIZE = 91
+STATE_N_SIZE = 91
 BLOCKS = (POSITION, VELOCITY, ATTITUDE)  # of the error state, in this order from its begin
 
 
 @compiled
-def answer(nominal: Vector, covariance: Covariance) -> Answer:
+def to_north_east_down(nominal: Vector, covariance: Covariance) -> StateN:
     """The state (91,) in north-east-down, of a nominal state and its covariance (n, n); slices as above."""
-    found = np.empty(ANSWER_SIZE)
+    found = np.empty(STATE_N_SIZE)
     to_n = mat_ne(nominal[POSITION_E])
     found[0], found[1], found[2] = geodetic(nominal[POSITION_E])
     found[VELOCITY_N] = times(to_n, nominal[VELOCITY_E])

@@ -28,20 +28,16 @@ from fusiond.filter.strapdown import ProcessNoise
 from fusiond.maths.portable import square
 from fusiond.maths.statistics import chi_square
 from fusiond.maths.typed import Array
+from fusiond.units import nanoseconds
 
-SECOND = 1_000_000_000  # ns
 CREEPING_TIME = 1.0  # s, over which a vehicle that creeps unseen keeps its speed
 
 
-def nanoseconds(seconds: float) -> int:
-    return round(seconds * 1e9)
-
-
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Parameters:
     sources: tuple[str, ...]  # sorted by name: the index of a source orders events as its name does
     models: tuple[int, ...]  # of each source: place in MODELS, or IMU
-    parameters: Array  # (sources, PARAMETERS)
+    model_parameters: Array  # (sources, PARAMETERS)
     constraints: Array  # (3, PARAMETERS): non-holonomic, zero velocity, zero rotation
     gates: tuple[float, ...]  # chi-square limit for 0, 1, 2, 3 degrees of freedom
     noise: ProcessNoise
@@ -73,7 +69,7 @@ class Plan:
     max_stored_age_ns: int
 
 
-def plan(config: Config, stored: StoredState | None = None) -> Plan:
+def make_parameters(config: Config, stored: StoredState | None = None) -> Parameters:
     """Lay a configuration out for the kernel, with what an earlier run has stored."""
     streams = config.streams()
     sources = tuple(sorted(streams))
@@ -82,10 +78,10 @@ def plan(config: Config, stored: StoredState | None = None) -> Plan:
     first, walks = _calibrations(config)
     (imu,) = config.imu.values()
     motion, settings = config.motion, config.filter
-    return Plan(
+    return Parameters(
         sources=sources,
         models=models,
-        parameters=np.array(rows),
+        model_parameters=np.array(rows),
         constraints=np.array([constraint.parameters(motion) for constraint in CONSTRAINTS]),
         gates=(math.inf, *(chi_square(settings.gate_probability, freedom) for freedom in (1, 2, 3))),
         noise=ProcessNoise(

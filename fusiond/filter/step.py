@@ -14,10 +14,10 @@ from __future__ import annotations
 import math
 
 from fusiond.filter import heading_bank, initial_alignment, source_health
-from fusiond.filter.measurement import factor_of, measure, remember
+from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Outcome, Row, Rows
 from fusiond.filter.state import (
     ALIGNING,
@@ -55,7 +55,7 @@ MIN_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 
 
 @compiled
-def step(state: FilterState, row: Row, imu: Row | None, plan: Plan) -> None:
+def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> None:
     """Take an event into the state and write its outcome; `imu` is the first IMU event at or after it, if there is one. Only
     where `can_step`."""
     t_ns, source = int(row["t_ns"]), int(row["source"])
@@ -65,64 +65,64 @@ def step(state: FilterState, row: Row, imu: Row | None, plan: Plan) -> None:
         return
     row["outcome"] = Outcome.FUSED
     if state.stamps[PHASE] == ALIGNING:
-        initial_alignment.gather_motion(state, row, plan)
+        initial_alignment.gather_motion(state, row, params)
     elif state.stamps[PHASE] == CHOOSING:
-        _choose(state, row, imu, plan)
+        _choose(state, row, imu, params)
         if state.stamps[PHASE] == CHOOSING:
             _guard_bank(state)
     else:
-        coasted = coasts(state, t_ns, plan)
-        advance(state, t_ns, imu, plan)
-        if plan.models[source] == IMU:
-            keep_sample(state, row, plan)
-            constrain(state, plan)
+        coasted = coasts(state, t_ns, params)
+        advance(state, t_ns, imu, params)
+        if params.models[source] == IMU:
+            keep_sample(state, row, params)
+            constrain(state, params)
         else:
             variance = yaw_variance(state) if coasted else 0.0
             lost = variance > square(LOST_HEADING)
-            if not (_measure_lost(state, row, plan, variance) if lost else measure(state, row, plan)):
+            if not (_fuse_while_lost(state, row, params, variance) if lost else fuse_measurement(state, row, params)):
                 row["outcome"] = Outcome.REJECTED
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
 
 
 @compiled
-def can_step(state: FilterState, row: Row, plan: Plan) -> bool:
+def can_step(state: FilterState, row: Row, params: Parameters) -> bool:
     """Whether `step` can take an event; if not, `step_rarely` must."""
     stamps, phase = state.stamps, int(state.stamps[PHASE])
-    t_ns, model = int(row["t_ns"]), int(plan.models[int(row["source"])])
-    if phase == EMPTY or t_ns - stamps[T] > plan.restart_gap_ns:
+    t_ns, model = int(row["t_ns"]), int(params.models[int(row["source"])])
+    if phase == EMPTY or t_ns - stamps[T] > params.restart_gap_ns:
         return False
     if phase == ALIGNING:
         return model not in (GNSS_POSITION, GNSS_VELOCITY)
-    if phase == RUNNING and model == IMU and coasts(state, t_ns, plan):
+    if phase == RUNNING and model == IMU and coasts(state, t_ns, params):
         grown = square(COAST_TURN) * ((t_ns - stamps[T]) * 1e-9)
         return not yaw_variance(state) + grown > square(LOST_HEADING) / 2
     return True
 
 
-def step_rarely(state: FilterState, row: Row, imu: Row | None, plan: Plan) -> None:
+def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> None:
     """Take an event that begins or ends something into the state, and write its outcome."""
     t_ns, source, stamps = int(row["t_ns"]), int(row["source"]), state.stamps
     _forget_judgement(row)
     if state.source_stamps[source, T_LAST] == t_ns:
         row["outcome"] = Outcome.DUPLICATE
         return
-    if stamps[PHASE] == EMPTY or t_ns - stamps[T] > plan.restart_gap_ns:
+    if stamps[PHASE] == EMPTY or t_ns - stamps[T] > params.restart_gap_ns:
         if stamps[PHASE] == RUNNING:
             _count_reset(state, ResetReason.DATA_GAP)
         initial_alignment.begin(state)
     row["outcome"] = Outcome.FUSED
     if stamps[PHASE] == ALIGNING:
-        initial_alignment.gather(state, row, plan)
+        initial_alignment.gather(state, row, params)
     else:  # the IMU is back
-        advance(state, t_ns, imu, plan)
-        if yaw_variance(state) > square(LOST_HEADING) and _heard_gnss(state, plan):
+        advance(state, t_ns, imu, params)
+        if yaw_variance(state) > square(LOST_HEADING) and _heard_gnss(state, params):
             _count_reset(state, ResetReason.HEADING_LOST)
             initial_alignment.begin(state)
-            initial_alignment.gather(state, row, plan)
+            initial_alignment.gather(state, row, params)
         else:
-            keep_sample(state, row, plan)
-            constrain(state, plan)
+            keep_sample(state, row, params)
+            constrain(state, params)
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
 
@@ -132,9 +132,9 @@ def _count_reset(state: FilterState, reason: ResetReason) -> None:
     state.stamps[RESET_REASON] = reason
 
 
-def _heard_gnss(state: FilterState, plan: Plan) -> bool:
+def _heard_gnss(state: FilterState, params: Parameters) -> bool:
     """Whether GNSS velocities came until the IMU fell silent, and so will again: without them an alignment would not end."""
-    return any(state.stamps[T_IMU] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS for i in plan.velocities)
+    return any(state.stamps[T_IMU] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS for i in params.velocities)
 
 
 @compiled
@@ -146,11 +146,11 @@ def _forget_judgement(row: Row) -> None:
 
 
 @compiled
-def _measure_lost(state: FilterState, row: Row, plan: Plan, variance: float) -> bool:
+def _fuse_while_lost(state: FilterState, row: Row, params: Parameters, variance: float) -> bool:
     """Fuse a measurement when the heading, of so much variance after coasting, is lost. It may correct position and
     velocity; what it says of a heading that is so far off is not to be relied on. When the IMU is back, an alignment finds
     it. Returns whether it was fused."""
-    fused = measure(state, row, plan)
+    fused = fuse_measurement(state, row, params)
     gained = variance - yaw_variance(state)
     if gained > 0:
         r, phi = state.nominal[POSITION_E], ATTITUDE.start
@@ -162,16 +162,16 @@ def _measure_lost(state: FilterState, row: Row, plan: Plan, variance: float) -> 
 
 
 @compiled
-def coasts(state: FilterState, t_ns: int, plan: Plan) -> bool:
+def coasts(state: FilterState, t_ns: int, params: Parameters) -> bool:
     """Whether the IMU has been silent for longer than `imu_gap` at an instant, so that the state coasts."""
-    return t_ns - state.stamps[T_IMU] > plan.imu_gap_ns
+    return t_ns - state.stamps[T_IMU] > params.imu_gap_ns
 
 
 @compiled
-def is_final(state: FilterState, source: int, plan: Plan) -> bool:
+def is_final(state: FilterState, source: int, params: Parameters) -> bool:
     """Whether no IMU sample still to come can change the state after an event of `source`: it is an IMU sample itself, or
     the state coasts."""
-    return plan.models[source] == IMU or coasts(state, state.stamps[T], plan)
+    return params.models[source] == IMU or coasts(state, state.stamps[T], params)
 
 
 @compiled
@@ -186,7 +186,7 @@ def yaw_variance(state: FilterState) -> float:
 
 
 @compiled
-def advance(state: FilterState, t_ns: int, imu: Row | None, plan: Plan) -> None:
+def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) -> None:
     """Carry the state to `t_ns`, on the IMU samples around it: the held one and `imu`, the next."""
     stamps, a = state.stamps, state.auxiliary
     begin, held = int(stamps[T]), int(stamps[T_IMU])
@@ -194,9 +194,9 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, plan: Plan) -> None:
         return
     dt = (t_ns - begin) * 1e-9
     stamps[T] = t_ns
-    frozen = not source_health.is_trusted(state.memory[plan.imu_source])
-    if imu is None or held == NEVER or imu["t_ns"] - held > plan.imu_gap_ns or frozen:
-        coast(state, dt, plan.noise, rests(state, plan))
+    frozen = not source_health.is_trusted(state.memory[params.imu_source])
+    if imu is None or held == NEVER or imu["t_ns"] - held > params.imu_gap_ns or frozen:
+        coast(state, dt, params.noise, rests(state, params))
         a[RATE_VARIANCE] = COAST_RATE * COAST_RATE
         return
     sample = imu["values"]
@@ -207,70 +207,70 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, plan: Plan) -> None:
     force_b, rate_b = a[HELD_FORCE_B] + middle * force_change, a[HELD_RATE_B] + middle * rate_change
     a[FORCE_B] = a[HELD_FORCE_B] + end * force_change
     a[RATE_B] = a[HELD_RATE_B] + end * rate_change
-    a[RATE_VARIANCE] = plan.noise.gyro / (span * 1e-9) * ((1 - end) * (1 - end) + end * end)
-    propagate(state, dt, force_b, rate_b, plan.noise)
+    a[RATE_VARIANCE] = params.noise.gyro / (span * 1e-9) * ((1 - end) * (1 - end) + end * end)
+    propagate(state, dt, force_b, rate_b, params.noise)
 
 
 @compiled
-def predict(state: FilterState, t_ns: int, plan: Plan) -> None:
+def predict(state: FilterState, t_ns: int, params: Parameters) -> None:
     """Carry the state beyond the newest IMU sample, on that sample for at most `imu_gap`, then coasting. For publication
     and then thrown away."""
     stamps, a = state.stamps, state.auxiliary
     begin = int(stamps[T])
     if t_ns <= begin or stamps[PHASE] != RUNNING:
         return
-    until = max(begin, min(t_ns, int(stamps[T_IMU] + plan.imu_gap_ns)))
-    if not source_health.is_trusted(state.memory[plan.imu_source]):
+    until = max(begin, min(t_ns, int(stamps[T_IMU] + params.imu_gap_ns)))
+    if not source_health.is_trusted(state.memory[params.imu_source]):
         until = begin
     if until > begin:
-        propagate(state, (until - begin) * 1e-9, a[HELD_FORCE_B], a[HELD_RATE_B], plan.noise)
+        propagate(state, (until - begin) * 1e-9, a[HELD_FORCE_B], a[HELD_RATE_B], params.noise)
     if t_ns > until:
-        coast(state, (t_ns - until) * 1e-9, plan.noise, rests(state, plan))
+        coast(state, (t_ns - until) * 1e-9, params.noise, rests(state, params))
     stamps[T] = t_ns
 
 
 @compiled
-def _choose(state: FilterState, row: Row, imu: Row | None, plan: Plan) -> None:
+def _choose(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> None:
     """Take one event into every hypothesis of the bank."""
     stamps, source, t_ns = state.stamps, int(row["source"]), int(row["t_ns"])
-    begin, model, values = int(stamps[T]), int(plan.models[source]), row["values"]
+    begin, model, values = int(stamps[T]), int(params.models[source]), row["values"]
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
             stamps[T] = begin
             hypothesis = state.hypothesis(i)
-            advance(hypothesis, t_ns, imu, plan)
+            advance(hypothesis, t_ns, imu, params)
     stamps[T] = max(begin, t_ns)
     if model == IMU:
-        keep_sample(state, row, plan)
-        heading_bank.constrain(state, plan)
+        keep_sample(state, row, params)
+        heading_bank.constrain(state, params)
         return
-    memory, own, parameter = state.memory[source], state.source_stamps[source], plan.parameters[source]
+    memory, own, parameter = state.memory[source], state.source_stamps[source], params.model_parameters[source]
     source_health.arrive(memory, own, values, t_ns)
     remember(memory, model, values)
-    if model == WHEEL_SPEED and carried(state, memory[LAST_SPEED], plan):
+    if model == WHEEL_SPEED and carried(state, memory[LAST_SPEED], params):
         row["outcome"] = Outcome.REJECTED
         return
     factor = factor_of(own, model, values, parameter, t_ns)
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
-            heading_bank.measure(state, i, model, values, parameter, factor, plan)
+            heading_bank.fuse_measurement(state, i, model, values, parameter, factor, params)
     own[T_FUSED] = t_ns
     if model == GNSS_POSITION:
         stamps[T_POSITION] = t_ns
-    heading_bank.collapse_if_close(state, plan)
+    heading_bank.collapse_if_close(state, params)
 
 
 @compiled
-def keep_sample(state: FilterState, row: Row, plan: Plan) -> None:
+def keep_sample(state: FilterState, row: Row, params: Parameters) -> None:
     """Make an IMU sample the held one; let it show standstill."""
     stamps, a, t_ns = state.stamps, state.auxiliary, int(row["t_ns"])
     dt = (t_ns - stamps[T_IMU]) * 1e-9 if stamps[T_IMU] != NEVER else 0.0
-    memory, own = state.memory[plan.imu_source], state.source_stamps[plan.imu_source]
+    memory, own = state.memory[params.imu_source], state.source_stamps[params.imu_source]
     same = source_health.arrive(memory, own, row["values"], t_ns)
     source_health.judge_repetition(memory, own, same, t_ns)
     hold(state, row["values"], t_ns)
-    a[RATE_VARIANCE] = plan.noise.gyro / max(dt, MIN_SPAN) if dt > 0 else 0.0
-    watch(state, a[HELD_FORCE_B], a[HELD_RATE_B], dt, plan)
+    a[RATE_VARIANCE] = params.noise.gyro / max(dt, MIN_SPAN) if dt > 0 else 0.0
+    watch(state, a[HELD_FORCE_B], a[HELD_RATE_B], dt, params)
 
 
 @compiled
@@ -349,26 +349,26 @@ def place(rows: Rows, begin: int, end: int, t_ns: int, source: int, sequence: in
 
 
 @compiled
-def first_changed(rows: Rows, begin: int, new: int, plan: Plan) -> int:
+def first_changed(rows: Rows, begin: int, new: int, params: Parameters) -> int:
     """The first row whose result a new event at row `new` changes: itself, but for an IMU sample all that interpolate
     between it and the sample before it, so not those at that sample's own instant."""
     i = begin + new
-    if plan.models[int(rows[i]["source"])] != IMU:
+    if params.models[int(rows[i]["source"])] != IMU:
         return new
-    while i > begin and plan.models[int(rows[i - 1]["source"])] != IMU:
+    while i > begin and params.models[int(rows[i - 1]["source"])] != IMU:
         i -= 1
     while begin < i < begin + new and rows[i]["t_ns"] == rows[i - 1]["t_ns"]:
         i += 1
     return i - begin
 
 
-def run_one(state: FilterState, rows: Rows, index: int, counts: Stamps, plan: Plan) -> int:
+def run_one(state: FilterState, rows: Rows, index: int, counts: Stamps, params: Parameters) -> int:
     """Apply one row, and correct the counts (sources, outcomes) if its outcome changed. Returns the index of the next."""
     row, following = rows[index], index
-    while following < len(rows) and plan.models[rows[following]["source"]] != IMU:
+    while following < len(rows) and params.models[rows[following]["source"]] != IMU:
         following += 1
     before, imu = int(row["outcome"]), rows[following] if following < len(rows) else None
-    (step if can_step(state, row, plan) else step_rarely)(state, row, imu, plan)
+    (step if can_step(state, row, params) else step_rarely)(state, row, imu, params)
     if row["outcome"] != before:
         counts[row["source"], before] -= 1
         counts[row["source"], row["outcome"]] += 1

@@ -24,8 +24,8 @@ def config_table(config: Config) -> dict[str, Any]:
 
 def info_message(config: Config, fusion: Fusion) -> InfoMessage:
     """What is running here."""
-    vehicle, plan = config.vehicle.name, fusion.plan
-    kinds = ("imu" if model == IMU else MODELS[model].name for model in plan.models)
+    vehicle, params = config.vehicle.name, fusion.params
+    kinds = ("imu" if model == IMU else MODELS[model].name for model in params.models)
     return InfoMessage(
         vehicle=vehicle,
         version=__version__,
@@ -33,7 +33,7 @@ def info_message(config: Config, fusion: Fusion) -> InfoMessage:
         encoding=config.publish.encoding,
         schemas=dict.fromkeys(MESSAGES, SCHEMA_VERSION),
         keys={kind: key(vehicle, kind, "*" if kind == "innovations" else "") for kind in MESSAGES},
-        sources=dict(zip(plan.sources, kinds, strict=True)),
+        sources=dict(zip(params.sources, kinds, strict=True)),
         config=config_table(config),
     )
 

@@ -35,10 +35,10 @@ class Innovations:
     """Measurements received, until the outcome of each is known. IMU samples have none: they propagate the state."""
 
     def __init__(self, vehicle: str, fusion: Fusion) -> None:
-        plan = fusion.plan
+        params = fusion.params
         self._vehicle, self._history = vehicle, fusion.history
-        self._imu = plan.sources[plan.imu_source]
-        self._margin_ns, self._ahead_ns = int(MARGIN * plan.horizon_ns), int(AHEAD * plan.horizon_ns)
+        self._imu = params.sources[params.imu_source]
+        self._margin_ns, self._ahead_ns = int(MARGIN * params.horizon_ns), int(AHEAD * params.horizon_ns)
         self._pending: list[Receipt] = []
         self._read: dict[Key, _Row] = {}  # rows of pending measurements that had to be read early
         self._unread_ns = NEVER_NS  # stamp of the oldest pending measurement whose row has not been read yet

@@ -120,7 +120,7 @@ class Publication:
             outputs=dict(around.outputs),
             calibration={
                 name: Calibration(value=value, sigma=sigma)
-                for name, (value, sigma) in calibrations(self._fusion.plan, self._fusion.history.head).items()
+                for name, (value, sigma) in calibrations(self._fusion.params, self._fusion.history.head).items()
             },
         )
 
@@ -132,7 +132,7 @@ class Sources:
         self._fusion = fusion
         self._received: dict[str, int] = {}  # last receipt [ns]
         self._clocks: dict[str, str] = {}
-        self._rates = dict.fromkeys(fusion.plan.sources, 0.0)
+        self._rates = dict.fromkeys(fusion.params.sources, 0.0)
         self._counted, self._counted_ns = fusion.history.counts.sum(axis=1), 0
 
     def add(self, event: Received) -> None:
@@ -148,7 +148,7 @@ class Sources:
         counted = self._fusion.history.counts.sum(axis=1)
         if self._counted_ns:
             rates = (counted - self._counted) * (SECOND / (t_ns - self._counted_ns))
-            self._rates = dict(zip(self._fusion.plan.sources, rates.tolist(), strict=True))
+            self._rates = dict(zip(self._fusion.params.sources, rates.tolist(), strict=True))
         self._counted, self._counted_ns = counted, t_ns
 
     def health(self, t_ns: int) -> dict[str, SourceHealth]:
@@ -156,7 +156,7 @@ class Sources:
         healths = fusion.health(t_ns)
         clocks, nis, counts = fusion.clock.report(), nis_means(fusion), fusion.history.counts.tolist()
         found = {}
-        for i, source in enumerate(fusion.plan.sources):
+        for i, source in enumerate(fusion.params.sources):
             last = self._received.get(source)
             found[source] = SourceHealth(
                 outcomes=outcome_counts(counts[i]),
@@ -182,7 +182,7 @@ class Changes:
         self._mode: Mode | None = None
         self._resets = 0
         self._present: frozenset[str] = frozenset()
-        self._statuses = dict.fromkeys(fusion.plan.sources, "nominal")
+        self._statuses = dict.fromkeys(fusion.params.sources, "nominal")
         self._next_status_ns: int = NEVER
 
     def since(self, state: StateMessage, present: frozenset[str]) -> Iterator[EventMessage]:
@@ -218,7 +218,7 @@ class Changes:
     def _reason(self) -> str:
         """The reason of the last reset, in words."""
         stamps = self._fusion.history.head.stamps
-        source = self._fusion.plan.sources[int(stamps[RESET_SOURCE])]
+        source = self._fusion.params.sources[int(stamps[RESET_SOURCE])]
         return {
             ResetReason.NONE: "",
             ResetReason.DATA_GAP: f"no data for more than {self._config.filter.restart_gap_s:g} s; aligning again",
@@ -234,11 +234,11 @@ def nis_means(fusion: Fusion) -> dict[str, float]:
     rows = fusion.history.rows
     axes = np.count_nonzero(rows["variance"] > 0, axis=1)
     tested = (axes > 0) & np.isfinite(rows["ratio"])
-    squares = rows["ratio"][tested] * np.array(fusion.plan.gates)[axes[tested]] / axes[tested]
-    number = len(fusion.plan.sources)
+    squares = rows["ratio"][tested] * np.array(fusion.params.gates)[axes[tested]] / axes[tested]
+    number = len(fusion.params.sources)
     counts = np.bincount(rows["source"][tested], minlength=number)
     sums = np.bincount(rows["source"][tested], weights=squares, minlength=number)
-    return {name: float(sums[i] / counts[i]) for i, name in enumerate(fusion.plan.sources) if counts[i]}
+    return {name: float(sums[i] / counts[i]) for i, name in enumerate(fusion.params.sources) if counts[i]}
 
 
 def _last_ratio(fusion: Fusion, source: int) -> float | None:

@@ -60,7 +60,7 @@ def learnt(config: Config, tlog: str) -> dict[str, tuple[float, float]]:
     """Value and sigma of every calibration at the end of the drive."""
     run = Replay(config, ReplayTask(config.publish.rate_hz))
     run.run(open_logs(logs(tlog), config))
-    return calibrations(run.fusion.plan, run.fusion.history.head)
+    return calibrations(run.fusion.params, run.fusion.history.head)
 
 
 def test_fixes_at_their_own_time() -> None:

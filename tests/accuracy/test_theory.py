@@ -58,7 +58,7 @@ def study() -> dict[str, np.ndarray]:
                     row[name].append(float(part @ np.linalg.solve(covariance[block, block], part)))
                 rows = fusion.history.rows
                 fixes = rows[(rows["source"] == 2) & (rows["t_ns"] > T0 + (event.sequence - 100) * SECOND // 100)]
-                tested += (fixes["ratio"] * fusion.plan.gates[3]).tolist()
+                tested += (fixes["ratio"] * fusion.params.gates[3]).tolist()
         assert fusion.totals()["REJECTED"] < 0.01 * len(events)
         assert np.abs(fusion.history.head.nominal[GYRO_BIAS_B] - gyro).max() < 2e-3
         assert np.abs(fusion.history.head.nominal[ACCEL_BIAS_B] - accel).max() < 0.15

@@ -188,7 +188,7 @@ def apply(configuration: Config, state: FilterState, events: Iterable[Measuremen
     """Run events through the kernel from a running state, without a history. The result's history has the rows and the
     head."""
     fusion = Fusion(configuration, compiled)
-    history, layout = fusion.history, fusion.plan
+    history, layout = fusion.history, fusion.params
     values = [(event, fusion._values(event)) for event in sorted(events, key=lambda event: event.key)]
     table = np.zeros(len(values) + 1, dtype=ROW)
     numbers, whole = np.zeros((len(values) + 2, len(state.numbers))), np.zeros((len(values) + 2, len(state.whole)), np.int64)

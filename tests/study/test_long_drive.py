@@ -13,7 +13,7 @@ import pytest
 from fusiond.config.schema import Config
 from fusiond.filter.kernel.interpreted import compiled_available, make_kernel
 from fusiond.filter.observations import IMU, MODEL
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.rows import ROW
 from fusiond.filter.state import BLOWN, POSITION_E, RESETS, VELOCITY_E, FilterState
 from fusiond.filter.step import run_one
@@ -72,7 +72,7 @@ class Course:
 
     def __init__(self) -> None:
         self.truth: Truth = simulate(parse(COURSE), SEED).truth
-        self.plan = plan(msgspec.convert(CONFIG, Config))
+        self.params = make_parameters(msgspec.convert(CONFIG, Config))
         truth, n = self.truth, len(self.truth.t_ns)
         self.round_ns = n * SECOND // IMU_HZ
         seconds = np.arange(n) / IMU_HZ
@@ -93,12 +93,12 @@ class Course:
             parts.append(wheel)
         table = np.concatenate(parts)
         self.table = table[np.lexsort((table["source"], table["t_ns"]))]
-        self.kind = np.array(self.plan.models)[self.table["source"]]
+        self.kind = np.array(self.params.models)[self.table["source"]]
 
     def _blank(self, at: np.ndarray, source: str) -> np.ndarray:
         rows = np.zeros(len(at), dtype=ROW)
         rows["t_ns"] = at * SECOND // IMU_HZ
-        rows["source"] = self.plan.sources.index(source)
+        rows["source"] = self.params.sources.index(source)
         return rows
 
     def rows(self, number: int, random: np.random.Generator) -> np.ndarray:
@@ -119,7 +119,7 @@ class Course:
 def drive(rounds: int) -> tuple[FilterState, list[float]]:
     """Drive the course; returns the last state and the NEES of horizontal position and velocity at each look."""
     course, random = Course(), np.random.default_rng(SEED)
-    settings = course.plan
+    settings = course.params
     kernel, head = make_kernel(settings), FilterState(len(settings.sources))
     counts = np.zeros((len(settings.sources), 6), dtype=np.int64)
     memory = np.zeros((4096, len(head.numbers))), np.zeros((4096, len(head.whole)), dtype=np.int64)

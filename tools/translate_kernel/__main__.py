@@ -11,7 +11,7 @@ both give the same bits. What may stand in such a function is small on purpose:
     Vector3 and its like a fixed number of floats: `mat_eb[i, j]`, `x[POSITION_E]`, `rates * dt + rest`, element by element
     views                a slice, a row or a column of an array is a view, as in NumPy: a pointer here
     np.array, np.empty, np.zeros, .copy()   memory of a constant size, on the stack here
-    FilterState, Plan, Row, Observation, ProcessNoise   the structs of FIELDS in kinds.py
+    FilterState, Parameters, Row, Observation, ProcessNoise   the structs of FIELDS in kinds.py
     if, while, for over range, a call of another such function, and math's functions
 
 A function that returns an array writes it where its caller says. Anything else is an error that names the line. A module's

@@ -20,7 +20,7 @@ SIZES = {  # constants that the structs and the kernel's class need by name, and
     ),
     "fusiond.filter.observations.model": ("VALUES", "PARAMETERS"),
     "fusiond.filter.observations": ("IMU",),
-    "fusiond.filter.north_east_down": ("ANSWER_SIZE",),
+    "fusiond.filter.north_east_down": ("STATE_N_SIZE",),
 }  # fmt: skip  # fmt: skip
 HEAD = """\
 # Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
@@ -60,23 +60,24 @@ def layout() -> str:
         found = importlib.import_module(module)
         lines += [f"    {name} = {int(getattr(found, name))}" for name in names]
     lines += ["    BLOCK = 1 + NOMINAL_SIZE + n * n  # numbers of a hypothesis: weight, nominal, covariance", ""]
-    for struct in ("Noise", "Observation", "Row", "State", "Plan"):
+    for struct in ("Noise", "Observation", "Row", "State", "Parameters"):
         lines.append(f"cdef struct {struct}:")
         for name, kind in FIELDS[struct].items():
             if struct == "Row" and name in ("source", "outcome"):
                 lines.append(f"    int32_t {name}")
-            elif kind.is_scalar or kind.name == "struct" or (struct in ("State", "Plan") and name != "gates"):
+            elif kind.is_scalar or kind.name == "struct" or (struct in ("State", "Parameters") and name != "gates"):
                 lines.append(f"    {kind.c} {name}")
             elif name == "jacobian":  # models name columns that only the wide state has
                 lines.append(f"    {kind.of} {name}[2 * n + WIDE_SIZE]")
             else:
                 lines.append(f"    {kind.of} {name}[{size_of(kind)}]")
-            if struct == "Plan" and name in COUNTED:
+            if struct == "Parameters" and name in COUNTED:
                 lines.append(f"    int64_t {name}_count")
         lines.append("")
-    scalars = [name for name, kind in FIELDS["Plan"].items() if kind.is_scalar]
-    lines += ["", "cdef int load_scalars(Plan* loaded, plan) except -1:", '    """The numbers of a fusiond.filter.Plan."""']
-    lines += [f"    loaded.{name} = plan.{name}" for name in scalars]
+    scalars = [name for name, kind in FIELDS["Parameters"].items() if kind.is_scalar]
+    lines += ["", "cdef int load_scalars(Parameters* loaded, params) except -1:"]
+    lines += ['    """The numbers of fusiond.filter.parameters.Parameters."""']
+    lines += [f"    loaded.{name} = params.{name}" for name in scalars]
     lines += ["    return 0", ""]
     return "\n".join(lines)
 

@@ -60,10 +60,10 @@ KINDS = {  # annotations
     "ErrorVector": vector("n"),
     "ErrorRows3": matrix("3", "n"),
     "Covariance": matrix("n", "n"),
-    "Answer": vector("ANSWER_SIZE"),
+    "StateN": vector("STATE_N_SIZE"),
     "Stamps": vector(of="int64_t"),
     "FilterState": Kind("pointer", "State"),
-    "Plan": Kind("pointer", "Plan"),
+    "Parameters": Kind("pointer", "Parameters"),
     "ProcessNoise": Kind("pointer", "Noise"),
     "Observation": Kind("pointer", "Observation"),
     "Row": Kind("pointer", "Row"),
@@ -101,12 +101,12 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "innovation": vector("3"),
         "variance": vector("3"),
     },
-    "Plan": {
+    "Parameters": {
         "noise": Kind("struct", "Noise"),
         "models": vector("", "int64_t"),
         "wheels": vector("", "int64_t"),
         "velocities": vector("", "int64_t"),
-        "parameters": matrix("", "PARAMETERS"),
+        "model_parameters": matrix("", "PARAMETERS"),
         "constraints": matrix("3", "PARAMETERS"),
         "gates": vector("4"),
         "imu_source": INT,
@@ -127,4 +127,4 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "heading_variance": FLOAT,
     },
 }
-COUNTED = {"models", "wheels", "velocities"}  # of Plan: lists whose length is a field as well
+COUNTED = {"models", "wheels", "velocities"}  # of Parameters: lists whose length is a field as well

@@ -105,7 +105,7 @@ class Translation(Expressions):
             return
         values = self._expression(node.iter)
         if values.kind.name != "vector" or not values.is_view:
-            self._fail(node.iter, "a loop goes over a range or a list of the plan")
+            self._fail(node.iter, "a loop goes over a range or a list of the parameters")
         counter = self._temporary("int64_t", "k")
         self._emit(f"for {counter} in range({self._length(node.iter, values)}):")
         self._depth += 1

@@ -402,15 +402,15 @@ cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double 
         lowest /= sqrt(100.0)
     state.bank[(i) * BLOCK + 0] *= ((((1 - 0.01) * portable_exp(((-square) / 2))) + (0.01 * lowest)) / size)
 
-cdef void heading_bank_take(State* state, int64_t i, State* hypothesis, Observation* seen, double factor, Plan* plan, bint weighed) noexcept nogil:
+cdef void heading_bank_fuse(State* state, int64_t i, State* hypothesis, Observation* seen, double factor, Parameters* params, bint weighed) noexcept nogil:
     cdef double across[3 * n]
     cdef double spread[3 * 3]
     measurement_update_project(hypothesis, seen, across, spread)
     if weighed:
         heading_bank_weigh(state, i, seen, factor, spread)
-    measurement_update_update_projected(hypothesis, seen, plan.gates[seen.m], factor, True, 0.01, across, spread)
+    measurement_update_update_projected(hypothesis, seen, params.gates[seen.m], factor, True, 0.01, across, spread)
 
-cdef void heading_bank_measure(State* state, int64_t i, int64_t model, double* values, double* parameter, double factor, Plan* plan) noexcept nogil:
+cdef void heading_bank_fuse_measurement(State* state, int64_t i, int64_t model, double* values, double* parameter, double factor, Parameters* params) noexcept nogil:
     cdef State hypothesis
     cdef Observation seen
     cdef double across[3 * n]
@@ -423,16 +423,16 @@ cdef void heading_bank_measure(State* state, int64_t i, int64_t model, double* v
         heading_bank_weigh(state, i, &seen, factor, spread)
     if observations_observe(&hypothesis, model, values, parameter, &seen):
         measurement_share_noise(&hypothesis, &seen, parameter)
-        heading_bank_take(state, i, &hypothesis, &seen, factor, plan, (model != 2))
+        heading_bank_fuse(state, i, &hypothesis, &seen, factor, params, (model != 2))
 
-cdef void heading_bank_constrain(State* state, Plan* plan) noexcept nogil:
+cdef void heading_bank_constrain(State* state, Parameters* params) noexcept nogil:
     cdef (bint, bint) _t1
     cdef bint still
     cdef bint rolling
     cdef Observation seen
     cdef int64_t i
     cdef State hypothesis
-    _t1 = motion_constraints_constraints_due(state, plan)
+    _t1 = motion_constraints_constraints_due(state, params)
     still = _t1[0]
     rolling = _t1[1]
     if (not (still or rolling)):
@@ -440,24 +440,24 @@ cdef void heading_bank_constrain(State* state, Plan* plan) noexcept nogil:
     for i in range(13):
         if (still and (state.bank[(i) * BLOCK + 0] > 0)):
             hypothesis = hypothesis_of(state, i)
-            motion_constraints_observe_constraint(&hypothesis, 1, plan, &seen)
+            motion_constraints_observe_constraint(&hypothesis, 1, params, &seen)
             model_with_rate_noise(&hypothesis, &seen)
-            heading_bank_take(state, i, &hypothesis, &seen, plan.zero_velocity_factor, plan, True)
-            motion_constraints_observe_constraint(&hypothesis, 2, plan, &seen)
+            heading_bank_fuse(state, i, &hypothesis, &seen, params.zero_velocity_factor, params, True)
+            motion_constraints_observe_constraint(&hypothesis, 2, params, &seen)
             model_with_rate_noise(&hypothesis, &seen)
-            heading_bank_take(state, i, &hypothesis, &seen, 1.0, plan, True)
+            heading_bank_fuse(state, i, &hypothesis, &seen, 1.0, params, True)
     if (rolling and (not still)):
-        heading_bank__roll(state, plan)
+        heading_bank__roll(state, params)
     heading_bank_normalise(state)
 
-cdef void heading_bank__roll(State* state, Plan* plan) noexcept nogil:
+cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
     cdef double* parameter
     cdef Observation seen
     cdef double fastest
     cdef int64_t i
     cdef State hypothesis
     cdef double _t1
-    parameter = plan.constraints + (0) * PARAMETERS
+    parameter = params.constraints + (0) * PARAMETERS
     fastest = 0.0
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
@@ -471,7 +471,7 @@ cdef void heading_bank__roll(State* state, Plan* plan) noexcept nogil:
             hypothesis = hypothesis_of(state, i)
             non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
             model_with_rate_noise(&hypothesis, &seen)
-            heading_bank_take(state, i, &hypothesis, &seen, 1.0, plan, True)
+            heading_bank_fuse(state, i, &hypothesis, &seen, 1.0, params, True)
 
 cdef void heading_bank_normalise(State* state) noexcept nogil:
     cdef double total
@@ -484,7 +484,7 @@ cdef void heading_bank_normalise(State* state) noexcept nogil:
         if (state.bank[(i) * BLOCK + 0] < 1e-09):
             state.bank[(i) * BLOCK + 0] = 0.0
 
-cdef void heading_bank_collapse_if_close(State* state, Plan* plan) noexcept nogil:
+cdef void heading_bank_collapse_if_close(State* state, Parameters* params) noexcept nogil:
     cdef int64_t best
     cdef int64_t i
     cdef State likeliest
@@ -533,7 +533,7 @@ cdef void heading_bank_collapse_if_close(State* state, Plan* plan) noexcept nogi
             spread += (state.bank[(i) * BLOCK + 0] * (own + ((turns[i] - mean) * (turns[i] - mean))))
             if (fabs(turns[i]) > 0.5235987755982988):
                 doubt += state.bank[(i) * BLOCK + 0]
-    if ((spread <= plan.heading_variance) and (doubt <= 0.0001)):
+    if ((spread <= params.heading_variance) and (doubt <= 0.0001)):
         heading_bank__collapse(state, best, errors)
 
 cdef double heading_bank__variance_along(State* hypothesis, double x, double y, double z) noexcept nogil:
@@ -591,7 +591,7 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
 
 # ---------------- fusiond.filter.initial_alignment
 
-cdef void initial_alignment_gather_motion(State* state, Row* row, Plan* plan) noexcept nogil:
+cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef double* a
     cdef double* values
@@ -607,13 +607,13 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Plan* plan) no
     values = row.values
     t_ns, source = (<int64_t>row.t_ns), (<int64_t>row.source)
     stamps[0] = t_ns
-    if (plan.models[source] == 2):
+    if (params.models[source] == 2):
         state.memory[(source) * MEMORY_SIZE + 0] = values[0]
-    if (plan.models[source] != -1):
+    if (params.models[source] != -1):
         return
     source_health_arrive(state.memory + (source) * MEMORY_SIZE, state.source_stamps + (source) * SOURCE_STAMPS_SIZE, values, t_ns)
     if (stamps[1] != (<int64_t>-4611686018427387904)):
-        motion_constraints_watch(state, values, values + 3, ((t_ns - stamps[1]) * 1e-09), plan)
+        motion_constraints_watch(state, values, values + 3, ((t_ns - stamps[1]) * 1e-09), params)
     stamps[1] = t_ns
     for i in range(3):
         _t1 = values[i]
@@ -622,8 +622,8 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Plan* plan) no
         _t2 = values[(3 + i)]
         a[(3 + i)] = _t2
         a[(9 + i)] = _t2
-    still = ((stamps[3] != (<int64_t>-4611686018427387904)) and ((t_ns - stamps[3]) >= plan.still_after_ns))
-    if (still and (not (initial_alignment__gnss_speed(state) >= plan.course_speed))):
+    still = ((stamps[3] != (<int64_t>-4611686018427387904)) and ((t_ns - stamps[3]) >= params.still_after_ns))
+    if (still and (not (initial_alignment__gnss_speed(state) >= params.course_speed))):
         for _i in range(3):
             (a + 21)[_i] = (a + 15)[_i]
         stamps[7] = t_ns
@@ -660,7 +660,7 @@ cdef double measurement_factor_of(int64_t* stamps, int64_t model, double* values
 cdef double measurement_correlation_of(int64_t model, double* values, double* parameter) noexcept nogil:
     return (values[2] if (model == 2) else parameter[3])
 
-cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil:
+cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef int64_t source
     cdef int64_t t_ns
     cdef int64_t model
@@ -691,9 +691,9 @@ cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil
     cdef double _t2
     cdef int64_t _t3
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
-    model = plan.models[source]
+    model = params.models[source]
     values = row.values
-    parameter = plan.parameters + (source) * PARAMETERS
+    parameter = params.model_parameters + (source) * PARAMETERS
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
     elapsed = source_health_since_last(stamps, t_ns)
@@ -716,7 +716,7 @@ cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil
         stamps[5] = t_ns
         source_health_begin(memory)
     companion = (<int64_t>(parameter[11]))
-    doubtful = motion_constraints_disputed(state, (source if (model == 1) else companion), plan)
+    doubtful = motion_constraints_disputed(state, (source if (model == 1) else companion), params)
     if (not doubtful):
         if source_health_is_due(stamps, t_ns, measurement_correlation_of(model, values, parameter)):
             known = ((stamps[1] != (<int64_t>-4611686018427387904)) and source_health_observes_sensor(spread, learnt, m))
@@ -725,17 +725,17 @@ cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil
         source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = (source_health_is_trusted(memory) and ((companion < 0) or source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))
     if ((model == 2) and trusted):
-        trusted = (not motion_constraints_carried(state, memory[0], plan))
+        trusted = (not motion_constraints_carried(state, memory[0], params))
     noisy = source_health_noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = (learnt[a] * noisy)
-    _t1 = measurement_update_update_projected(state, &seen, plan.gates[m], weight, trusted, parameter[12], across, spread)
+    _t1 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
     ratio = _t1[0]
     fused = _t1[1]
     _t2 = ratio
     row.ratio = _t2
     memory[2] = _t2
-    if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, plan)):
+    if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, params)):
         measurement__reset(state, source, &seen, (<int64_t>(parameter[13])))
         source_health_begin(memory)
         fused = True
@@ -750,7 +750,7 @@ cdef bint measurement_measure(State* state, Row* row, Plan* plan) noexcept nogil
         stamps[2] = t_ns
     return fused
 
-cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Plan* plan) noexcept nogil:
+cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Parameters* params) noexcept nogil:
     cdef double* memory
     cdef int64_t* stamps
     cdef bint off
@@ -759,16 +759,16 @@ cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Ob
     cdef bint returns
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
-    off = source_health_moved(memory, seen.innovation, seen.variance, seen.m, plan.gates[seen.m])
+    off = source_health_moved(memory, seen.innovation, seen.variance, seen.m, params.gates[seen.m])
     if (off or (stamps[4] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>5000000000))):
         stamps[4] = t_ns
         return False
-    wait = plan.gnss_reset_ns
-    companion = (<int64_t>(plan.parameters[(source) * PARAMETERS + 11]))
+    wait = params.gnss_reset_ns
+    companion = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 11]))
     returns = ((stamps[1] == (<int64_t>-4611686018427387904)) or ((stamps[4] - stamps[5]) <= (<int64_t>10000000000)))
-    if ((returns and (memory[2] <= 9.0)) or motion_constraints_is_carried(state, plan)):
-        wait = plan.gnss_return_ns
-    elif ((plan.models[source] == 1) or ((companion >= 0) and (not source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))):
+    if ((returns and (memory[2] <= 9.0)) or motion_constraints_is_carried(state, params)):
+        wait = params.gnss_return_ns
+    elif ((params.models[source] == 1) or ((companion >= 0) and (not source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))):
         wait = (6 * wait)
     return ((t_ns - stamps[4]) >= wait)
 
@@ -1136,7 +1136,7 @@ cdef void measurement_update_difference(State* one, State* other, double* out) n
 
 # ---------------- fusiond.filter.motion_constraints
 
-cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b, double dt, Plan* plan) noexcept nogil:
+cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b, double dt, Parameters* params) noexcept nogil:
     cdef double* auxiliary
     cdef double smooth
     cdef int _i
@@ -1162,7 +1162,7 @@ cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b
     for _i in range(3):
         (auxiliary + 15)[_i] += (step * off[_i])
     auxiliary[19] = motion_constraints__scatter(auxiliary[19], off, step)
-    if (not motion_constraints_stands(state, plan)):
+    if (not motion_constraints_stands(state, params)):
         state.stamps[3] = (<int64_t>-4611686018427387904)
     elif (state.stamps[3] == (<int64_t>-4611686018427387904)):
         state.stamps[3] = state.stamps[0]
@@ -1170,39 +1170,39 @@ cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b
 cdef double motion_constraints__scatter(double before, double* off, double step) noexcept nogil:
     return ((1 - step) * (before + (step * (((off[0] * off[0]) + (off[1] * off[1])) + (off[2] * off[2])))))
 
-cdef bint motion_constraints_carried(State* state, double wheel_speed, Plan* plan) noexcept nogil:
+cdef bint motion_constraints_carried(State* state, double wheel_speed, Parameters* params) noexcept nogil:
     cdef int64_t i
     cdef int64_t _k1
     cdef bint fresh
-    if (not (fabs(wheel_speed) <= plan.still_wheel)):
+    if (not (fabs(wheel_speed) <= params.still_wheel)):
         return False
-    for _k1 in range(plan.velocities_count):
-        i = plan.velocities[_k1]
+    for _k1 in range(params.velocities_count):
+        i = params.velocities[_k1]
         fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 2000000000)
         if (fresh and (state.memory[(i) * MEMORY_SIZE + 1] > 1.0) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
             return True
     return False
 
-cdef bint motion_constraints_rests(State* state, Plan* plan) noexcept nogil:
+cdef bint motion_constraints_rests(State* state, Parameters* params) noexcept nogil:
     cdef bint heard
     cdef int64_t i
     cdef int64_t _k1
     heard = False
-    for _k1 in range(plan.wheels_count):
-        i = plan.wheels[_k1]
+    for _k1 in range(params.wheels_count):
+        i = params.wheels[_k1]
         if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
             heard = True
-            if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= plan.still_wheel)):
+            if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= params.still_wheel)):
                 return False
     return heard
 
-cdef bint motion_constraints_is_carried(State* state, Plan* plan) noexcept nogil:
-    return (motion_constraints_rests(state, plan) and motion_constraints_carried(state, 0.0, plan))
+cdef bint motion_constraints_is_carried(State* state, Parameters* params) noexcept nogil:
+    return (motion_constraints_rests(state, params) and motion_constraints_carried(state, 0.0, params))
 
-cdef bint motion_constraints_disputed(State* state, int64_t velocity, Plan* plan) noexcept nogil:
-    return ((velocity >= 0) and (state.memory[(velocity) * MEMORY_SIZE + 1] > 0.0) and motion_constraints_rests(state, plan))
+cdef bint motion_constraints_disputed(State* state, int64_t velocity, Parameters* params) noexcept nogil:
+    return ((velocity >= 0) and (state.memory[(velocity) * MEMORY_SIZE + 1] > 0.0) and motion_constraints_rests(state, params))
 
-cdef bint motion_constraints_stands(State* state, Plan* plan) noexcept nogil:
+cdef bint motion_constraints_stands(State* state, Parameters* params) noexcept nogil:
     cdef double* auxiliary
     cdef bint wheeled
     cdef double interval
@@ -1212,59 +1212,59 @@ cdef bint motion_constraints_stands(State* state, Plan* plan) noexcept nogil:
     cdef double _t3
     cdef double _t4
     auxiliary = state.auxiliary
-    if ((not plan.standstill) or (auxiliary[20] < 0.8)):
+    if ((not params.standstill) or (auxiliary[20] < 0.8)):
         return False
-    wheeled = (plan.wheels_count > 0)
-    interval = (state.memory[(plan.imu_source) * MEMORY_SIZE + 13] if wheeled else 0.0)
+    wheeled = (params.wheels_count > 0)
+    interval = (state.memory[(params.imu_source) * MEMORY_SIZE + 13] if wheeled else 0.0)
     own = ((6.75 / interval) if (interval > 0) else 0.0)
-    _t1 = portable_square(plan.still_accel)
-    _t2 = (own * plan.noise.accel)
+    _t1 = portable_square(params.still_accel)
+    _t2 = (own * params.noise.accel)
     if (auxiliary[18] > (_t2 if _t2 > _t1 else _t1)):
         return False
-    _t3 = portable_square(plan.still_gyro)
-    _t4 = (own * plan.noise.gyro)
+    _t3 = portable_square(params.still_gyro)
+    _t4 = (own * params.noise.gyro)
     if (auxiliary[19] > (_t4 if _t4 > _t3 else _t3)):
         return False
-    return (((not wheeled) or motion_constraints_rests(state, plan)) and (not motion_constraints_carried(state, 0.0, plan)))
+    return (((not wheeled) or motion_constraints_rests(state, params)) and (not motion_constraints_carried(state, 0.0, params)))
 
-cdef void motion_constraints_constrain(State* state, Plan* plan) noexcept nogil:
+cdef void motion_constraints_constrain(State* state, Parameters* params) noexcept nogil:
     cdef (bint, bint) _t1
     cdef bint still
     cdef bint rolling
-    _t1 = motion_constraints_constraints_due(state, plan)
+    _t1 = motion_constraints_constraints_due(state, params)
     still = _t1[0]
     rolling = _t1[1]
-    if (still and motion_constraints__apply(state, 1, plan, plan.zero_velocity_factor)):
-        motion_constraints__apply(state, 2, plan, 1.0)
+    if (still and motion_constraints__apply(state, 1, params, params.zero_velocity_factor)):
+        motion_constraints__apply(state, 2, params, 1.0)
     elif rolling:
-        motion_constraints__apply(state, 0, plan, 1.0)
+        motion_constraints__apply(state, 0, params, 1.0)
 
-cdef (bint, bint) motion_constraints_constraints_due(State* state, Plan* plan) noexcept nogil:
+cdef (bint, bint) motion_constraints_constraints_due(State* state, Parameters* params) noexcept nogil:
     cdef int64_t now
     cdef bint still
     now = state.stamps[0]
-    if ((now - state.stamps[2]) < plan.constraint_interval_ns):
+    if ((now - state.stamps[2]) < params.constraint_interval_ns):
         return (False, False)
     state.stamps[2] = now
-    still = ((state.stamps[3] != (<int64_t>-4611686018427387904)) and ((now - state.stamps[3]) >= plan.still_after_ns))
-    return (still, (plan.non_holonomic and (not motion_constraints_is_carried(state, plan))))
+    still = ((state.stamps[3] != (<int64_t>-4611686018427387904)) and ((now - state.stamps[3]) >= params.still_after_ns))
+    return (still, (params.non_holonomic and (not motion_constraints_is_carried(state, params))))
 
-cdef bint motion_constraints_observe_constraint(State* state, int64_t which, Plan* plan, Observation* seen) noexcept nogil:
+cdef bint motion_constraints_observe_constraint(State* state, int64_t which, Parameters* params, Observation* seen) noexcept nogil:
     if (which == 1):
-        return zero_velocity_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
+        return zero_velocity_observe(state, params.constraints + (which) * PARAMETERS, params.constraints + (which) * PARAMETERS, seen)
     if (which == 2):
-        return zero_rotation_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
-    return non_holonomic_observe(state, plan.constraints + (which) * PARAMETERS, plan.constraints + (which) * PARAMETERS, seen)
+        return zero_rotation_observe(state, params.constraints + (which) * PARAMETERS, params.constraints + (which) * PARAMETERS, seen)
+    return non_holonomic_observe(state, params.constraints + (which) * PARAMETERS, params.constraints + (which) * PARAMETERS, seen)
 
-cdef bint motion_constraints__apply(State* state, int64_t which, Plan* plan, double factor) noexcept nogil:
+cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* params, double factor) noexcept nogil:
     cdef Observation seen
     cdef (double, bint) _t1
     cdef double ratio
     cdef bint fused
-    if (not motion_constraints_observe_constraint(state, which, plan, &seen)):
+    if (not motion_constraints_observe_constraint(state, which, params, &seen)):
         return False
     model_with_rate_noise(state, &seen)
-    _t1 = measurement_update_update(state, &seen, plan.gates[seen.m], factor, True, 0.0)
+    _t1 = measurement_update_update(state, &seen, params.gates[seen.m], factor, True, 0.0)
     ratio = _t1[0]
     fused = _t1[1]
     state.auxiliary[(32 + which)] = ratio
@@ -1276,7 +1276,7 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Plan* plan, dou
 
 # ---------------- fusiond.filter.north_east_down
 
-cdef void north_east_down_answer(double* nominal, double* covariance, double* out) noexcept nogil:
+cdef void north_east_down_to_north_east_down(double* nominal, double* covariance, double* out) noexcept nogil:
     cdef double found[91]
     cdef double to_n[3 * 3]
     cdef (double, double, double) _t1
@@ -1311,7 +1311,7 @@ cdef void north_east_down_answer(double* nominal, double* covariance, double* ou
             for i in range(3):
                 for j in range(3):
                     found[(((10 + (9 * (a + i))) + b) + j)] = (((turned[(i) * 3 + 0] * to_n[(j) * 3 + 0]) + (turned[(i) * 3 + 1] * to_n[(j) * 3 + 1])) + (turned[(i) * 3 + 2] * to_n[(j) * 3 + 2]))
-    for _i in range(ANSWER_SIZE):
+    for _i in range(STATE_N_SIZE):
         out[_i] = found[_i]
     return
 
@@ -2017,7 +2017,7 @@ cdef bint source_health_moved(double* memory, double* innovation, double* varian
 
 # ---------------- fusiond.filter.step
 
-cdef void step_step(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil:
+cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexcept nogil:
     cdef int64_t t_ns
     cdef int64_t source
     cdef bint coasted
@@ -2030,26 +2030,26 @@ cdef void step_step(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil
         return
     row.outcome = 0
     if (state.stamps[9] == 1):
-        initial_alignment_gather_motion(state, row, plan)
+        initial_alignment_gather_motion(state, row, params)
     elif (state.stamps[9] == 3):
-        step__choose(state, row, imu, plan)
+        step__choose(state, row, imu, params)
         if (state.stamps[9] == 3):
             step__guard_bank(state)
     else:
-        coasted = step_coasts(state, t_ns, plan)
-        step_advance(state, t_ns, imu, plan)
-        if (plan.models[source] == -1):
-            step_keep_sample(state, row, plan)
-            motion_constraints_constrain(state, plan)
+        coasted = step_coasts(state, t_ns, params)
+        step_advance(state, t_ns, imu, params)
+        if (params.models[source] == -1):
+            step_keep_sample(state, row, params)
+            motion_constraints_constrain(state, params)
         else:
             variance = (step_yaw_variance(state) if coasted else 0.0)
             lost = (variance > portable_square(0.20943951023931956))
-            if (not (step__measure_lost(state, row, plan, variance) if lost else measurement_measure(state, row, plan))):
+            if (not (step__fuse_while_lost(state, row, params, variance) if lost else measurement_fuse_measurement(state, row, params))):
                 row.outcome = 1
         step_guard(state)
     state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
 
-cdef bint step_can_step(State* state, Row* row, Plan* plan) noexcept nogil:
+cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef int64_t phase
     cdef int64_t t_ns
@@ -2057,12 +2057,12 @@ cdef bint step_can_step(State* state, Row* row, Plan* plan) noexcept nogil:
     cdef double grown
     stamps = state.stamps
     phase = (<int64_t>(state.stamps[9]))
-    t_ns, model = (<int64_t>row.t_ns), (<int64_t>(plan.models[(<int64_t>row.source)]))
-    if ((phase == 0) or ((t_ns - stamps[0]) > plan.restart_gap_ns)):
+    t_ns, model = (<int64_t>row.t_ns), (<int64_t>(params.models[(<int64_t>row.source)]))
+    if ((phase == 0) or ((t_ns - stamps[0]) > params.restart_gap_ns)):
         return False
     if (phase == 1):
         return (model != 0 and model != 1)
-    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, plan)):
+    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params)):
         grown = (portable_square(0.3) * ((t_ns - stamps[0]) * 1e-09))
         return (not ((step_yaw_variance(state) + grown) > (portable_square(0.20943951023931956) / 2)))
     return True
@@ -2075,14 +2075,14 @@ cdef void step__forget_judgement(Row* row) noexcept nogil:
     for _i in range(3):
         row.variance[_i] = 0.0
 
-cdef bint step__measure_lost(State* state, Row* row, Plan* plan, double variance) noexcept nogil:
+cdef bint step__fuse_while_lost(State* state, Row* row, Parameters* params, double variance) noexcept nogil:
     cdef bint fused
     cdef double gained
     cdef double* r
     cdef int64_t phi
     cdef int64_t i
     cdef int64_t j
-    fused = measurement_measure(state, row, plan)
+    fused = measurement_fuse_measurement(state, row, params)
     gained = (variance - step_yaw_variance(state))
     if (gained > 0):
         r = state.nominal
@@ -2093,11 +2093,11 @@ cdef bint step__measure_lost(State* state, Row* row, Plan* plan, double variance
                 state.covariance[((phi + i)) * n + (phi + j)] += ((r[i] * r[j]) * gained)
     return fused
 
-cdef bint step_coasts(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
-    return ((t_ns - state.stamps[1]) > plan.imu_gap_ns)
+cdef bint step_coasts(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
+    return ((t_ns - state.stamps[1]) > params.imu_gap_ns)
 
-cdef bint step_is_final(State* state, int64_t source, Plan* plan) noexcept nogil:
-    return ((plan.models[source] == -1) or step_coasts(state, state.stamps[0], plan))
+cdef bint step_is_final(State* state, int64_t source, Parameters* params) noexcept nogil:
+    return ((params.models[source] == -1) or step_coasts(state, state.stamps[0], params))
 
 cdef double step_yaw_variance(State* state) noexcept nogil:
     cdef double* r
@@ -2113,7 +2113,7 @@ cdef double step_yaw_variance(State* state) noexcept nogil:
             total += ((r[i] * state.covariance[((phi + i)) * n + (phi + j)]) * r[j])
     return (total / (((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2])))
 
-cdef void step_advance(State* state, int64_t t_ns, Row* imu, Plan* plan) noexcept nogil:
+cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef double* a
     cdef int64_t begin
@@ -2136,9 +2136,9 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Plan* plan) noexcep
         return
     dt = ((t_ns - begin) * 1e-09)
     stamps[0] = t_ns
-    frozen = (not source_health_is_trusted(state.memory + (plan.imu_source) * MEMORY_SIZE))
-    if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > plan.imu_gap_ns) or frozen):
-        strapdown_coast(state, dt, &plan.noise, motion_constraints_rests(state, plan))
+    frozen = (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE))
+    if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > params.imu_gap_ns) or frozen):
+        strapdown_coast(state, dt, &params.noise, motion_constraints_rests(state, params))
         a[35] = (0.5 * 0.5)
         return
     sample = imu.values
@@ -2157,10 +2157,10 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Plan* plan) noexcep
         (a + 6)[_i] = (a[_i] + (end * force_change[_i]))
     for _i in range(3):
         (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
-    a[35] = ((plan.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
-    strapdown_propagate(state, dt, force_b, rate_b, &plan.noise)
+    a[35] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
+    strapdown_propagate(state, dt, force_b, rate_b, &params.noise)
 
-cdef void step_predict(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
+cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef double* a
     cdef int64_t begin
@@ -2172,18 +2172,18 @@ cdef void step_predict(State* state, int64_t t_ns, Plan* plan) noexcept nogil:
     begin = (<int64_t>(stamps[0]))
     if ((t_ns <= begin) or (stamps[9] != 2)):
         return
-    _t1 = (<int64_t>((stamps[1] + plan.imu_gap_ns)))
+    _t1 = (<int64_t>((stamps[1] + params.imu_gap_ns)))
     _t2 = (_t1 if _t1 < t_ns else t_ns)
     until = (_t2 if _t2 > begin else begin)
-    if (not source_health_is_trusted(state.memory + (plan.imu_source) * MEMORY_SIZE)):
+    if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         until = begin
     if (until > begin):
-        strapdown_propagate(state, ((until - begin) * 1e-09), a, a + 3, &plan.noise)
+        strapdown_propagate(state, ((until - begin) * 1e-09), a, a + 3, &params.noise)
     if (t_ns > until):
-        strapdown_coast(state, ((t_ns - until) * 1e-09), &plan.noise, motion_constraints_rests(state, plan))
+        strapdown_coast(state, ((t_ns - until) * 1e-09), &params.noise, motion_constraints_rests(state, params))
     stamps[0] = t_ns
 
-cdef void step__choose(State* state, Row* row, Row* imu, Plan* plan) noexcept nogil:
+cdef void step__choose(State* state, Row* row, Row* imu, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef int64_t source
     cdef int64_t t_ns
@@ -2200,36 +2200,36 @@ cdef void step__choose(State* state, Row* row, Row* imu, Plan* plan) noexcept no
     source = (<int64_t>row.source)
     t_ns = (<int64_t>row.t_ns)
     begin = (<int64_t>(stamps[0]))
-    model = (<int64_t>(plan.models[source]))
+    model = (<int64_t>(params.models[source]))
     values = row.values
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
             stamps[0] = begin
             hypothesis = hypothesis_of(state, i)
-            step_advance(&hypothesis, t_ns, imu, plan)
+            step_advance(&hypothesis, t_ns, imu, params)
     stamps[0] = (t_ns if t_ns > begin else begin)
     if (model == -1):
-        step_keep_sample(state, row, plan)
-        heading_bank_constrain(state, plan)
+        step_keep_sample(state, row, params)
+        heading_bank_constrain(state, params)
         return
     memory = state.memory + (source) * MEMORY_SIZE
     own = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
-    parameter = plan.parameters + (source) * PARAMETERS
+    parameter = params.model_parameters + (source) * PARAMETERS
     source_health_arrive(memory, own, values, t_ns)
     measurement_remember(memory, model, values)
-    if ((model == 2) and motion_constraints_carried(state, memory[0], plan)):
+    if ((model == 2) and motion_constraints_carried(state, memory[0], params)):
         row.outcome = 1
         return
     factor = measurement_factor_of(own, model, values, parameter, t_ns)
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
-            heading_bank_measure(state, i, model, values, parameter, factor, plan)
+            heading_bank_fuse_measurement(state, i, model, values, parameter, factor, params)
     own[1] = t_ns
     if (model == 0):
         stamps[4] = t_ns
-    heading_bank_collapse_if_close(state, plan)
+    heading_bank_collapse_if_close(state, params)
 
-cdef void step_keep_sample(State* state, Row* row, Plan* plan) noexcept nogil:
+cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef double* a
     cdef int64_t t_ns
@@ -2241,13 +2241,13 @@ cdef void step_keep_sample(State* state, Row* row, Plan* plan) noexcept nogil:
     a = state.auxiliary
     t_ns = (<int64_t>row.t_ns)
     dt = (((t_ns - stamps[1]) * 1e-09) if (stamps[1] != (<int64_t>-4611686018427387904)) else 0.0)
-    memory = state.memory + (plan.imu_source) * MEMORY_SIZE
-    own = state.source_stamps + (plan.imu_source) * SOURCE_STAMPS_SIZE
+    memory = state.memory + (params.imu_source) * MEMORY_SIZE
+    own = state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE
     same = source_health_arrive(memory, own, row.values, t_ns)
     source_health_judge_repetition(memory, own, same, t_ns)
     step_hold(state, row.values, t_ns)
-    a[35] = ((plan.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
-    motion_constraints_watch(state, a, a + 3, dt, plan)
+    a[35] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
+    motion_constraints_watch(state, a, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
     cdef double* a
@@ -2320,12 +2320,12 @@ cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int
         i -= 1
     return (i - begin)
 
-cdef int64_t step_first_changed(Row* rows, int64_t begin, int64_t new, Plan* plan) noexcept nogil:
+cdef int64_t step_first_changed(Row* rows, int64_t begin, int64_t new, Parameters* params) noexcept nogil:
     cdef int64_t i
     i = (begin + new)
-    if (plan.models[(<int64_t>(((rows + i)).source))] != -1):
+    if (params.models[(<int64_t>(((rows + i)).source))] != -1):
         return new
-    while ((i > begin) and (plan.models[(<int64_t>(((rows + (i - 1))).source))] != -1)):
+    while ((i > begin) and (params.models[(<int64_t>(((rows + (i - 1))).source))] != -1)):
         i -= 1
     while ((begin < i < (begin + new)) and (((rows + i)).t_ns == ((rows + (i - 1))).t_ns)):
         i += 1

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.filter.north_east_down import answer
-from fusiond.filter.parameters import Plan
+from fusiond.filter.north_east_down import to_north_east_down
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import ROW, Outcome, Rows
 from fusiond.filter.state import WIDE_SIZE, FilterState, T
 from fusiond.filter.step import can_step, first_changed, is_final, place, predict, run_one
@@ -24,11 +24,11 @@ Memory = tuple[Array, NDArray[np.int64], NDArray[np.int64]]  # snapshots: number
 
 
 class Kernel:
-    """The operations of the hot loop for one plan, on the memory that `attach` gives it. The history decides what to do
-    when; this does it."""
+    """The operations of the hot loop for one set of parameters, on the memory that `attach` gives it. The history decides
+    what to do when; this does it."""
 
-    def __init__(self, plan: Plan) -> None:
-        self.plan = plan
+    def __init__(self, params: Parameters) -> None:
+        self.params = params
 
     def attach(
         self,
@@ -46,15 +46,15 @@ class Kernel:
 
     def propagate(self, state: FilterState, dt: float, force_b: Array, rate_b: Array) -> None:
         """One strapdown propagation over dt [s] (fusiond.filter.strapdown.propagate)."""
-        propagate(state, dt, force_b, rate_b, self.plan.noise)
+        propagate(state, dt, force_b, rate_b, self.params.noise)
 
     def predict(self, state: FilterState, t_ns: int) -> None:
         """Carry a state to an instant for publication (fusiond.filter.step.predict)."""
-        predict(state, t_ns, self.plan)
+        predict(state, t_ns, self.params)
 
-    def answer(self, nominal: Array, covariance: Array) -> Array:
-        """The state in north-east-down (fusiond.filter.north_east_down.answer)."""
-        return answer(nominal, covariance)
+    def to_north_east_down(self, nominal: Array, covariance: Array) -> Array:
+        """The state in north-east-down (fusiond.filter.north_east_down.to_north_east_down)."""
+        return to_north_east_down(nominal, covariance)
 
     def place(self, begin: int, end: int, t_ns: int, source: int, sequence: int) -> int:
         """Where an event goes in the table (fusiond.filter.step.place)."""
@@ -96,7 +96,7 @@ class Kernel:
         if new < 0:
             return new
         self.insert(begin + new, end, t_ns, source, sequence, t_receive_ns, Outcome.WAITING, values)
-        return first_changed(self.table, begin, new, self.plan)
+        return first_changed(self.table, begin, new, self.params)
 
     def restore(self, kept: int) -> None:
         """Copy the last of the snapshots ..kept into the head."""
@@ -109,21 +109,21 @@ class Kernel:
         Returns the rows applied, the snapshots kept, and whether it is done. If not, it wants memory for snapshots, or the
         next row is one that only `run_one` can apply.
         """
-        rows, plan = self.table[begin:end], self.plan
+        rows, params = self.table[begin:end], self.params
         while applied < len(rows) and rows[applied]["t_ns"] <= limit_ns:
-            if kept == len(self._memory[2]) or not can_step(self.head, rows[applied], plan):
+            if kept == len(self._memory[2]) or not can_step(self.head, rows[applied], params):
                 return applied, kept, False
-            applied = run_one(self.head, rows, applied, self.counts, plan)
-            kept = keep(self.head, rows, applied, plan, self._memory, kept)
+            applied = run_one(self.head, rows, applied, self.counts, params)
+            kept = keep(self.head, rows, applied, params, self._memory, kept)
         return applied, kept, True
 
 
-def keep(head: FilterState, rows: Rows, applied: int, plan: Plan, memory: Memory, kept: int) -> int:
+def keep(head: FilterState, rows: Rows, applied: int, params: Parameters, memory: Memory, kept: int) -> int:
     """Keep the head in row `kept` of `memory` if a snapshot is due after `applied` rows, and final. Returns the number
     of snapshots kept."""
     numbers, whole, counts = memory
-    due = head.stamps[T] - whole[kept - 1, T] >= plan.snapshot_interval_ns
-    if not due or not is_final(head, int(rows[applied - 1]["source"]), plan):
+    due = head.stamps[T] - whole[kept - 1, T] >= params.snapshot_interval_ns
+    if not due or not is_final(head, int(rows[applied - 1]["source"]), params):
         return kept
     numbers[kept], whole[kept], counts[kept] = head.numbers, head.whole, applied
     return kept + 1
@@ -137,11 +137,11 @@ def compiled_available() -> bool:
     return find_spec("fusiond.filter.kernel.narrow") is not None
 
 
-def make_kernel(plan: Plan, compiled: bool | None = None) -> AnyKernel:
+def make_kernel(params: Parameters, compiled: bool | None = None) -> AnyKernel:
     """The compiled kernel, or the interpreted one where it was not built; `compiled` asks for one of the two. ImportError if
     the compiled one is asked for and was not built."""
     if compiled is None:
         compiled = compiled_available()
     if not compiled:
-        return Kernel(plan)
-    return import_module(f"fusiond.filter.kernel.{'wide' if plan.size == WIDE_SIZE else 'narrow'}").Kernel(plan)
+        return Kernel(params)
+    return import_module(f"fusiond.filter.kernel.{'wide' if params.size == WIDE_SIZE else 'narrow'}").Kernel(params)

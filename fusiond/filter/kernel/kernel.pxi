@@ -26,9 +26,9 @@ include "functions.pxi"
 
 
 cdef class Kernel:
-    """The compiled counterpart of fusiond.filter.kernel.interpreted.Kernel, for one plan."""
+    """The compiled counterpart of fusiond.filter.kernel.interpreted.Kernel, for one set of parameters."""
 
-    cdef Plan plan
+    cdef Parameters params
     cdef State state  # the one that is bound
     cdef int64_t sources
     cdef int64_t[::1] models, wheels, velocities
@@ -42,27 +42,27 @@ cdef class Kernel:
     cdef int64_t[::1] kept_applied
     cdef int64_t numbers_size, core_size  # of a state, with and without the bank of hypotheses
 
-    def __init__(self, plan):
-        if plan.size != n:
-            raise ValueError(f"compiled for {n} error states, not {plan.size}")
-        self.sources = len(plan.sources)
+    def __init__(self, params):
+        if params.size != n:
+            raise ValueError(f"compiled for {n} error states, not {params.size}")
+        self.sources = len(params.sources)
         self.models, self.wheels, self.velocities = (
-            np.array(numbers, dtype=np.int64) for numbers in (plan.models, plan.wheels, plan.velocities))
-        self.parameters = np.ascontiguousarray(plan.parameters)
-        self.constraints = np.ascontiguousarray(plan.constraints)
-        load_scalars(&self.plan, plan)
-        self.plan.models, self.plan.models_count = &self.models[0], len(plan.models)
-        self.plan.wheels, self.plan.wheels_count = (&self.wheels[0] if len(plan.wheels) else NULL), len(plan.wheels)
-        self.plan.velocities_count = len(plan.velocities)
-        self.plan.velocities = &self.velocities[0] if len(plan.velocities) else NULL
-        self.plan.parameters, self.plan.constraints = &self.parameters[0, 0], &self.constraints[0, 0]
+            np.array(numbers, dtype=np.int64) for numbers in (params.models, params.wheels, params.velocities))
+        self.parameters = np.ascontiguousarray(params.model_parameters)
+        self.constraints = np.ascontiguousarray(params.constraints)
+        load_scalars(&self.params, params)
+        self.params.models, self.params.models_count = &self.models[0], len(params.models)
+        self.params.wheels, self.params.wheels_count = (&self.wheels[0] if len(params.wheels) else NULL), len(params.wheels)
+        self.params.velocities_count = len(params.velocities)
+        self.params.velocities = &self.velocities[0] if len(params.velocities) else NULL
+        self.params.model_parameters, self.params.constraints = &self.parameters[0, 0], &self.constraints[0, 0]
         for i in range(4):
-            self.plan.gates[i] = plan.gates[i]
-        noise = plan.noise
-        self.plan.noise.accel, self.plan.noise.gyro = noise.accel, noise.gyro
-        self.plan.noise.accel_bias, self.plan.noise.gyro_bias = noise.accel_bias, noise.gyro_bias
+            self.params.gates[i] = params.gates[i]
+        noise = params.noise
+        self.params.noise.accel, self.params.noise.gyro = noise.accel, noise.gyro
+        self.params.noise.accel_bias, self.params.noise.gyro_bias = noise.accel_bias, noise.gyro_bias
         for i in range(n - CALIBRATIONS):
-            self.plan.noise.calibrations[i] = noise.calibrations[i]
+            self.params.noise.calibrations[i] = noise.calibrations[i]
         self.core_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
         self.numbers_size = self.core_size + HYPOTHESES * BLOCK
 
@@ -84,19 +84,19 @@ cdef class Kernel:
     def propagate(self, state, double dt, double[::1] force_b, double[::1] rate_b):
         """fusiond.filter.strapdown.propagate"""
         self.bind(state.numbers, state.whole)
-        strapdown_propagate(&self.state, dt, &force_b[0], &rate_b[0], &self.plan.noise)
+        strapdown_propagate(&self.state, dt, &force_b[0], &rate_b[0], &self.params.noise)
 
     def predict(self, state, int64_t t_ns):
         """fusiond.filter.step.predict"""
         self.bind(state.numbers, state.whole)
-        step_predict(&self.state, t_ns, &self.plan)
+        step_predict(&self.state, t_ns, &self.params)
 
-    def answer(self, double[::1] nominal, double[:, ::1] covariance):
-        """fusiond.filter.north_east_down.answer"""
+    def to_north_east_down(self, double[::1] nominal, double[:, ::1] covariance):
+        """fusiond.filter.north_east_down.to_north_east_down"""
         if nominal.shape[0] != NOMINAL_SIZE or covariance.shape[0] != n or covariance.shape[1] != n:
             raise ValueError(f"a state of {n} error states is needed, not {covariance.shape[0]}")
-        cdef double[::1] found = np.empty(ANSWER_SIZE)
-        north_east_down_answer(&nominal[0], &covariance[0, 0], &found[0])
+        cdef double[::1] found = np.empty(STATE_N_SIZE)
+        north_east_down_to_north_east_down(&nominal[0], &covariance[0, 0], &found[0])
         return found.base
 
     def attach(self, head, Row[::1] table, int64_t[:, ::1] counts, double[:, ::1] kept_numbers,
@@ -117,7 +117,7 @@ cdef class Kernel:
         if new < 0:
             return new
         self.insert(begin + new, end, t_ns, source, sequence, t_receive_ns, WAITING, values)
-        return step_first_changed(&self.table[0], begin, new, &self.plan)
+        return step_first_changed(&self.table[0], begin, new, &self.params)
 
     cpdef insert(self, int64_t at, int64_t end, int64_t t_ns, int32_t source, int64_t sequence, int64_t t_receive_ns,
                  int32_t outcome, tuple values):
@@ -159,14 +159,14 @@ cdef class Kernel:
                 done = True
                 break
             row = rows + applied
-            if kept == room or not step_can_step(&self.state, row, &self.plan):
+            if kept == room or not step_can_step(&self.state, row, &self.params):
                 break
             if following < applied:
                 following = applied
-            while following < count and self.plan.models[rows[following].source] != IMU:
+            while following < count and self.params.models[rows[following].source] != IMU:
                 following += 1
             before = row.outcome
-            step_step(&self.state, row, rows + following if following < count else NULL, &self.plan)
+            step_step(&self.state, row, rows + following if following < count else NULL, &self.params)
             if row.outcome != before:
                 self.counts[row.source, before] -= 1
                 self.counts[row.source, row.outcome] += 1
@@ -178,9 +178,9 @@ cdef class Kernel:
     cdef inline int64_t keep(self, int64_t source, int64_t applied, int64_t kept) noexcept nogil:
         """fusiond.filter.kernel.interpreted.keep"""
         cdef int64_t size = self.core_size
-        if self.state.stamps[T] - self.kept_whole[kept - 1, T] < self.plan.snapshot_interval_ns:
+        if self.state.stamps[T] - self.kept_whole[kept - 1, T] < self.params.snapshot_interval_ns:
             return kept
-        if not step_is_final(&self.state, source, &self.plan):
+        if not step_is_final(&self.state, source, &self.params):
             return kept
         if self.state.stamps[PHASE] == CHOOSING:
             size = self.numbers_size

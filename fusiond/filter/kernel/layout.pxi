@@ -15,7 +15,7 @@ cdef enum:
     VALUES = 8
     PARAMETERS = 16
     IMU = -1
-    ANSWER_SIZE = 91
+    STATE_N_SIZE = 91
     BLOCK = 1 + NOMINAL_SIZE + n * n  # numbers of a hypothesis: weight, nominal, covariance
 
 cdef struct Noise:
@@ -53,7 +53,7 @@ cdef struct State:
     int64_t size
     int64_t sources
 
-cdef struct Plan:
+cdef struct Parameters:
     Noise noise
     int64_t* models
     int64_t models_count
@@ -61,7 +61,7 @@ cdef struct Plan:
     int64_t wheels_count
     int64_t* velocities
     int64_t velocities_count
-    double* parameters
+    double* model_parameters
     double* constraints
     double gates[4]
     int64_t imu_source
@@ -82,22 +82,22 @@ cdef struct Plan:
     double heading_variance
 
 
-cdef int load_scalars(Plan* loaded, plan) except -1:
-    """The numbers of a fusiond.filter.Plan."""
-    loaded.imu_source = plan.imu_source
-    loaded.imu_gap_ns = plan.imu_gap_ns
-    loaded.restart_gap_ns = plan.restart_gap_ns
-    loaded.gnss_reset_ns = plan.gnss_reset_ns
-    loaded.gnss_return_ns = plan.gnss_return_ns
-    loaded.constraint_interval_ns = plan.constraint_interval_ns
-    loaded.still_after_ns = plan.still_after_ns
-    loaded.snapshot_interval_ns = plan.snapshot_interval_ns
-    loaded.standstill = plan.standstill
-    loaded.non_holonomic = plan.non_holonomic
-    loaded.course_speed = plan.course_speed
-    loaded.still_wheel = plan.still_wheel
-    loaded.still_gyro = plan.still_gyro
-    loaded.still_accel = plan.still_accel
-    loaded.zero_velocity_factor = plan.zero_velocity_factor
-    loaded.heading_variance = plan.heading_variance
+cdef int load_scalars(Parameters* loaded, params) except -1:
+    """The numbers of fusiond.filter.parameters.Parameters."""
+    loaded.imu_source = params.imu_source
+    loaded.imu_gap_ns = params.imu_gap_ns
+    loaded.restart_gap_ns = params.restart_gap_ns
+    loaded.gnss_reset_ns = params.gnss_reset_ns
+    loaded.gnss_return_ns = params.gnss_return_ns
+    loaded.constraint_interval_ns = params.constraint_interval_ns
+    loaded.still_after_ns = params.still_after_ns
+    loaded.snapshot_interval_ns = params.snapshot_interval_ns
+    loaded.standstill = params.standstill
+    loaded.non_holonomic = params.non_holonomic
+    loaded.course_speed = params.course_speed
+    loaded.still_wheel = params.still_wheel
+    loaded.still_gyro = params.still_gyro
+    loaded.still_accel = params.still_accel
+    loaded.zero_velocity_factor = params.zero_velocity_factor
+    loaded.heading_variance = params.heading_variance
     return 0

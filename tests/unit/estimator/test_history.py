@@ -220,7 +220,7 @@ def test_a_dropped_event_has_no_outcome(compiled: bool) -> None:
 def test_counts_sum_to_the_events_offered(compiled: bool) -> None:
     rng = np.random.default_rng(1)
     fusion, offered = Fusion(settings(horizon_s=0.4), compiled), 0
-    by_source = dict.fromkeys(fusion.plan.sources, 0)
+    by_source = dict.fromkeys(fusion.params.sources, 0)
     arrivals = [e.t_ns + round(rng.exponential(0.15) * SECOND) for e in EVENTS]
     for i in np.argsort(arrivals, kind="stable")[:2000]:
         original = EVENTS[i]

@@ -43,7 +43,7 @@ def installed(
 
 
 def learnt(fusion: Fusion) -> dict[str, tuple[float, float]]:
-    return calibrations(fusion.plan, fusion.history.head)
+    return calibrations(fusion.params, fusion.history.head)
 
 
 @needs_compiled

@@ -15,7 +15,7 @@ from fusiond.filter import source_health as health
 from fusiond.filter.measurement_update import CLUTTER_FIELD, detection, difference, inject, update
 from fusiond.filter.observations import wheel_speed
 from fusiond.filter.observations.model import SHARED, Observation
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
     ATTITUDE,
     BELIEF,
@@ -80,7 +80,7 @@ def test_silence_is_evidence_of_absence() -> None:
 
 def test_a_collapsed_bank_has_the_moments_of_its_mixture() -> None:
     """B6, in the error space about the likeliest hypothesis."""
-    rng, settings = np.random.default_rng(4), plan(config())
+    rng, settings = np.random.default_rng(4), make_parameters(config())
     state = running_state(rng)
     state.stamps[PHASE] = CHOOSING
     errors = rng.normal(0.0, 1e-3, (3, state.size))
@@ -124,8 +124,8 @@ def test_a_fix_that_may_be_clutter(metres: float) -> None:
 def test_wheels_that_share_an_error_are_worth_what_gauss_and_markov_allow() -> None:
     """A5: fused one by one, with variances grown for it, they are worth the best mean of all."""
     wheel = {"group": "axles", "shared_sigma_mps": 0.08, "sigma_mps": 0.1}
-    settings = plan(config(wheel=wheel))
-    grown = [0.1**2 * settings.parameters[i, SHARED] for i in settings.wheels]
+    settings = make_parameters(config(wheel=wheel))
+    grown = [0.1**2 * settings.model_parameters[i, SHARED] for i in settings.wheels]
     assert len(grown) > 1
     alone = fused(np.zeros(len(grown)), np.array(grown))[1]
     covariance = shared_covariance(np.full(len(grown), 0.1**2), 0.08**2)

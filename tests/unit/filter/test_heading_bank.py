@@ -12,7 +12,7 @@ from fusiond.estimator.solution import Mode
 from fusiond.events import GnssVelocity, Measurement
 from fusiond.filter.heading_bank import collapse_if_close, normalise, weigh
 from fusiond.filter.observations.model import Observation
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import BLOWN, CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
 from fusiond.maths.wgs84 import mat_ne
 from tests.conftest import needs_compiled
@@ -147,7 +147,7 @@ def test_a_bank_without_weight_does_not_settle() -> None:
     for weight in (0.0, math.nan):
         state.bank[:, 0] = weight
         with np.errstate(invalid="ignore"):
-            collapse_if_close(state, plan(config()))
+            collapse_if_close(state, make_parameters(config()))
         assert state.stamps[PHASE] == CHOOSING
 
 

@@ -13,7 +13,7 @@ from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import Measurement
 from fusiond.filter.hot_start import DOUBTED_WEIGHT, USED_WEIGHT, Verdict, aged
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
     ALIGNING,
     CHOOSING,
@@ -242,7 +242,7 @@ def test_stale_or_from_the_future_it_is_a_cold_start(age_ns: int, verdict: Verdi
 
 
 def test_variances_grow_with_age_up_to_those_of_a_cold_start() -> None:
-    kept, layout = stored(), plan(config(), stored())
+    kept, layout = stored(), make_parameters(config(), stored())
     state, before = FilterState(len(layout.sources)), None
     cold = [layout.imu.gyro_bias_sigma**2] * 3 + [layout.imu.accel_bias_sigma**2] * 3 + layout.calibration_variances.tolist()
     for age_ns in (0, SECOND, HOUR, 24 * HOUR, 365 * 24 * HOUR):
@@ -255,7 +255,7 @@ def test_variances_grow_with_age_up_to_those_of_a_cold_start() -> None:
 
 
 def test_a_frozen_calibration_stays_at_zero() -> None:
-    layout = plan(config(filter={"wheel_scale_sigma": 0.0}), stored())
+    layout = make_parameters(config(filter={"wheel_scale_sigma": 0.0}), stored())
     state = FilterState(len(layout.sources))
     state.stamps[T] = stored().t_ns
     values, variances = aged(stored(), state, layout)

@@ -20,7 +20,7 @@ from fusiond.filter.measurement_update import (
     whiten,
 )
 from fusiond.filter.observations.model import Observation
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
     ATTITUDE,
     ERROR_SIZE,
@@ -114,7 +114,7 @@ def test_order_of_independent_sensors_does_not_matter() -> None:
 
 def test_riccati_steady_state() -> None:
     """B1: a random walk of q a step, seen with r, settles at p = (q + sqrt(q^2 + 4 q r)) / 2 before each measurement."""
-    layout = plan(config(filter={"wheel_scale_walk": 0.1}))
+    layout = make_parameters(config(filter={"wheel_scale_walk": 0.1}))
     r, q, state = 0.5, 0.01, scalar_state(0.0, 10.0)
     state.nominal[:3] = 6.4e6, 0.0, 0.0
     for _ in range(200):

@@ -9,11 +9,11 @@ import pytest
 
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, MODEL, WHEEL_SPEED, wheel_speed
 from fusiond.filter.observations.model import CLUTTER, COMPANION, CORRELATION, NOISE_MAX, NOISE_MIN, RESETS, SHARED
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import ERROR_SIZE, FURTHER_SCALES_ERROR, HEIGHT_OFFSET_ERROR, POSITION, SCALE, VELOCITY, WIDE_SIZE
 from tests.helpers.streams import config
 
-PLAN = plan(
+PARAMS = make_parameters(
     config(
         ("left", "right"),
         gnss={"position_correlation_s": 2.0, "velocity_correlation_s": 3.0, "outliers": "mixture", "outlier_share": 0.07},
@@ -27,12 +27,12 @@ PLAN = plan(
 
 def column(which: int) -> dict[str, float]:
     """What stands in the rows of all sources but the inertial sensor."""
-    rows = zip(PLAN.sources, PLAN.parameters[:, which].tolist(), strict=True)
+    rows = zip(PARAMS.sources, PARAMS.model_parameters[:, which].tolist(), strict=True)
     return {source: value for source, value in rows if source != "imu0"}
 
 
 def test_sources_are_sorted_by_name_with_their_models() -> None:
-    assert dict(zip(PLAN.sources, PLAN.models, strict=True)) == {
+    assert dict(zip(PARAMS.sources, PARAMS.models, strict=True)) == {
         "baro": MODEL["barometric_height"],
         "gps0.position": GNSS_POSITION,
         "gps0.velocity": GNSS_VELOCITY,
@@ -41,8 +41,8 @@ def test_sources_are_sorted_by_name_with_their_models() -> None:
         "right": WHEEL_SPEED,
         "yaw0": MODEL["gnss_yaw"],
     }
-    assert list(PLAN.sources) == sorted(PLAN.sources)
-    assert [PLAN.sources[i] for i in (PLAN.imu_source, *PLAN.wheels, *PLAN.velocities)] == [
+    assert list(PARAMS.sources) == sorted(PARAMS.sources)
+    assert [PARAMS.sources[i] for i in (PARAMS.imu_source, *PARAMS.wheels, *PARAMS.velocities)] == [
         "imu0",
         "left",
         "right",
@@ -66,7 +66,7 @@ def test_what_a_source_resets_and_whom_it_trusts_with() -> None:
     blocks = {"gps0.position": POSITION.start, "gps0.velocity": VELOCITY.start, "baro": HEIGHT_OFFSET_ERROR.start}
     assert column(RESETS) == other | blocks
     nobody = dict.fromkeys(column(COMPANION), -1.0)
-    assert column(COMPANION) == nobody | {"gps0.position": PLAN.sources.index("gps0.velocity")}
+    assert column(COMPANION) == nobody | {"gps0.position": PARAMS.sources.index("gps0.velocity")}
     assert column(CLUTTER) == dict.fromkeys(nobody, 0.0) | {"gps0.position": 0.07, "gps0.velocity": 0.07}
     assert column(SHARED) == dict.fromkeys(nobody, 1.0)  # no groups
 
@@ -79,12 +79,12 @@ def test_bounds_of_learnt_noise_are_of_variances() -> None:
 def test_a_scale_for_each_wheel_widens_the_state() -> None:
     scales = column(wheel_speed.SCALE_STATE)
     assert (scales["left"], scales["right"]) == (SCALE.start, FURTHER_SCALES_ERROR.start)
-    assert (PLAN.size, plan(config()).size) == (WIDE_SIZE, ERROR_SIZE)
-    assert len(PLAN.calibration_variances) == len(PLAN.noise.calibrations) == WIDE_SIZE - 15
+    assert (PARAMS.size, make_parameters(config()).size) == (WIDE_SIZE, ERROR_SIZE)
+    assert len(PARAMS.calibration_variances) == len(PARAMS.noise.calibrations) == WIDE_SIZE - 15
 
 
 def test_gates_are_of_chi_square() -> None:
     """Of no axis, one, two, three: the last three from tables, at 0.999."""
-    assert PLAN.gates[0] == math.inf
-    np.testing.assert_allclose(PLAN.gates[1:], [10.828, 13.816, 16.266], atol=1e-3)
-    assert plan(config(filter={"gate_probability": 0.95})).gates[3] == pytest.approx(7.815, abs=1e-3)
+    assert PARAMS.gates[0] == math.inf
+    np.testing.assert_allclose(PARAMS.gates[1:], [10.828, 13.816, 16.266], atol=1e-3)
+    assert make_parameters(config(filter={"gate_probability": 0.95})).gates[3] == pytest.approx(7.815, abs=1e-3)

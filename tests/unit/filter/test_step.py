@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from fusiond.filter.kernel.interpreted import make_kernel
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.rows import ROW
 from fusiond.filter.state import ALIGNING, CHOOSING, EMPTY, PHASE, RUNNING, T_IMU, FilterState, T
 from fusiond.filter.step import can_step, first_changed, yaw_variance
 from tests.helpers.streams import MS, SECOND, T0, config, running_state
 
-PLAN = plan(config(filter={"restart_gap_s": 30.0, "imu_gap_s": 0.2}))
-IMU, POSITION, WHEEL = (PLAN.sources.index(name) for name in ("imu0", "gps0.position", "front_left"))
+PARAMS = make_parameters(config(filter={"restart_gap_s": 30.0, "imu_gap_s": 0.2}))
+IMU, POSITION, WHEEL = (PARAMS.sources.index(name) for name in ("imu0", "gps0.position", "front_left"))
 Key = tuple[int, int, int]  # t_ns, source, sequence
 
 
@@ -27,11 +27,11 @@ def table(keys: list[Key], room: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(5))
 def test_an_event_goes_where_its_key_belongs(compiled: bool, seed: int) -> None:
     """Keys of few stamps, sources and sequences, so that many meet; inserted one by one, and compared with a sorted set."""
-    rng, kernel = np.random.default_rng(seed), make_kernel(PLAN, compiled)
+    rng, kernel = np.random.default_rng(seed), make_kernel(PARAMS, compiled)
     begin, end, kept = 3, 3, set[Key]()  # the live part need not begin with the table
-    rows, head = table([], 80), FilterState(len(PLAN.sources))
+    rows, head = table([], 80), FilterState(len(PARAMS.sources))
     rows["t_ns"] = T0 + 5
-    counts = np.zeros((len(PLAN.sources), 6), np.int64)
+    counts = np.zeros((len(PARAMS.sources), 6), np.int64)
     kernel.attach(head, rows, counts, head.numbers[None].copy(), head.whole[None].copy(), np.zeros(1, np.int64))
     for _ in range(70):
         t_ns, source, sequence = key = T0 + int(rng.integers(5)), int(rng.integers(4)), int(rng.integers(4))
@@ -53,9 +53,9 @@ def test_an_imu_sample_changes_what_interpolates_to_it() -> None:
     comes after it."""
     ms = [(0, IMU), (0, WHEEL), (3, WHEEL), (3, POSITION), (7, WHEEL), (10, IMU), (12, WHEEL)]
     rows = table([(T0 + t * MS, source, number) for number, (t, source) in enumerate(ms)])
-    assert [first_changed(rows, 0, new, PLAN) for new in range(len(rows))] == [0, 1, 2, 3, 4, 2, 6]
-    assert first_changed(rows, 3, 2, PLAN) == 0  # rows before the live part are out of reach
-    assert first_changed(rows, 1, 4, PLAN) == 0  # and without a sample in it, all its rows interpolate
+    assert [first_changed(rows, 0, new, PARAMS) for new in range(len(rows))] == [0, 1, 2, 3, 4, 2, 6]
+    assert first_changed(rows, 3, 2, PARAMS) == 0  # rows before the live part are out of reach
+    assert first_changed(rows, 1, 4, PARAMS) == 0  # and without a sample in it, all its rows interpolate
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_what_only_the_interpreter_takes(phase: int, source: int, after_s: float
     state.covariance[6:9, 6:9] = 1e-6 * np.eye(3)
     state.stamps[[PHASE, T, T_IMU]] = phase, T0, T0
     row = table([(T0 + round(after_s * SECOND), source, 0)])[0]
-    assert can_step(state, row, PLAN) is taken
+    assert can_step(state, row, PARAMS) is taken
 
 
 def test_yaw_variance_is_that_about_the_vertical() -> None:

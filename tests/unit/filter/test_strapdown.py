@@ -11,7 +11,7 @@ import pytest
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement
 from fusiond.filter.kernel.interpreted import AnyKernel, make_kernel
 from fusiond.filter.measurement_update import inject
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -105,7 +105,7 @@ class Path:
 
 @pytest.fixture
 def kernel(compiled: bool) -> AnyKernel:
-    return make_kernel(plan(config(imu=QUIET)), compiled)
+    return make_kernel(make_parameters(config(imu=QUIET)), compiled)
 
 
 @pytest.mark.parametrize("place", ANYWHERE.values(), ids=ANYWHERE)
@@ -260,7 +260,7 @@ def test_coasting_against_finite_differences(compiled: bool) -> None:
     state = running_state(np.random.default_rng(4))
     state.stamps[T_IMU] = T0 - 10 * SECOND  # the IMU is long silent
     state.nominal[3:6] *= 0.1  # so that turns, by which a velocity turns along, are little noise
-    kernel = make_kernel(plan(config(imu=QUIET)), compiled)
+    kernel = make_kernel(make_parameters(config(imu=QUIET)), compiled)
 
     def carry(moved: FilterState) -> None:
         kernel.predict(moved, T0 + 100 * MS)
@@ -276,7 +276,7 @@ def test_coasting_against_finite_differences(compiled: bool) -> None:
 def test_process_noise(compiled: bool) -> None:
     """From nothing, the covariance grows as its densities say: by their own integrals."""
     imu = {"accel_noise": 0.1, "gyro_noise": 2e-3, "accel_bias_walk": 1e-3, "gyro_bias_walk": 1e-5}
-    layout = plan(config(imu=imu, filter={"wheel_scale_walk": 1e-4, "mount_walk_deg": 0.1}))
+    layout = make_parameters(config(imu=imu, filter={"wheel_scale_walk": 1e-4, "mount_walk_deg": 0.1}))
     state, path = Path(MUNICH, 0.0).state(), Path(MUNICH, 0.0)
     make_kernel(layout, compiled).propagate(state, DT, *path.felt(0.0))
     p = state.covariance
@@ -300,7 +300,7 @@ def test_coasting_noise(compiled: bool) -> None:
     turns along. All by their integrals."""
     state = Path(MUNICH, 10.0).state()
     state.stamps[[T, T_IMU, PHASE]] = T0, T0 - 10 * SECOND, RUNNING
-    make_kernel(plan(config()), compiled).predict(state, T0 + SECOND)
+    make_kernel(make_parameters(config()), compiled).predict(state, T0 + SECOND)
     up = state.nominal[:3] / np.linalg.norm(state.nominal[:3])
     sideways = np.cross(up, state.nominal[3:6])
     assert np.linalg.norm(sideways) > 5.0
@@ -317,7 +317,7 @@ def test_coasting_noise(compiled: bool) -> None:
 
 
 def test_covariance_stays_symmetric_and_positive_definite(compiled: bool) -> None:
-    kernel = make_kernel(plan(config()), compiled)
+    kernel = make_kernel(make_parameters(config()), compiled)
     rng = np.random.default_rng(6)
     state = running_state(rng)
     for _ in range(500):

@@ -24,7 +24,7 @@ from fusiond.filter.kernel.interpreted import Kernel, compiled_available, make_k
 from fusiond.filter.measurement import SUSPECT
 from fusiond.filter.north_east_down import COVARIANCE_N, GEODETIC, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations.model import mat_eb
-from fusiond.filter.parameters import plan
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
     BLOWN,
@@ -113,7 +113,7 @@ def both(settings: Config, state: FilterState, events: list[Measurement]) -> tup
 @pytest.mark.parametrize("wide", [False, True], ids=["", "wide"])
 @pytest.mark.parametrize("seed", range(20))
 def test_propagate(seed: int, wide: bool) -> None:
-    rng, layout = np.random.default_rng(seed), plan(config(gnss=LEARNT if wide else {}))
+    rng, layout = np.random.default_rng(seed), make_parameters(config(gnss=LEARNT if wide else {}))
     state = running_state(rng, size=layout.size)
     other, dt = state.copy(), float(rng.uniform(1e-6, 0.12))
     force, rate = rng.normal(0.0, 5.0, 3) - [0, 0, 9.8], rng.normal(0.0, 0.5, 3)
@@ -124,7 +124,7 @@ def test_propagate(seed: int, wide: bool) -> None:
 
 def test_turns_and_pauses_of_every_size() -> None:
     """The attitude after a turn shows sine and cosine, the weight of the means the exponential."""
-    rng, layout = np.random.default_rng(1), plan(config())
+    rng, layout = np.random.default_rng(1), make_parameters(config())
     compiled, interpreted = make_kernel(layout, True), make_kernel(layout, False)
     for _ in range(200):
         state = running_state(rng)
@@ -142,11 +142,11 @@ def test_turns_and_pauses_of_every_size() -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_answer(seed: int, wide: bool) -> None:
     """In north-east-down, all over the Earth; and the frame's definition."""
-    rng, layout = np.random.default_rng(seed), plan(config(gnss=LEARNT if wide else {}))
+    rng, layout = np.random.default_rng(seed), make_parameters(config(gnss=LEARNT if wide else {}))
     state = running_state(rng, size=layout.size)
     state.nominal[POSITION_E] = ecef(rng.uniform(-1.57, 1.57), rng.uniform(-3.14, 3.14), rng.uniform(-100.0, 9000.0))
-    found = make_kernel(layout, False).answer(state.nominal, state.covariance)
-    np.testing.assert_array_equal(bits(found), bits(make_kernel(layout, True).answer(state.nominal, state.covariance)))
+    found, fast = (make_kernel(layout, which).to_north_east_down(state.nominal, state.covariance) for which in (False, True))
+    np.testing.assert_array_equal(bits(found), bits(fast))
     to_n = mat_ne(state.nominal[POSITION_E])
     assert np.allclose(ecef(*found[GEODETIC]), state.nominal[POSITION_E], atol=1e-8)
     assert np.allclose(found[VELOCITY_N], to_n @ state.nominal[VELOCITY_E])
@@ -159,7 +159,7 @@ def test_answer(seed: int, wide: bool) -> None:
 @pytest.mark.parametrize("silent_ms", [0, 5, 199, 200, 3000])
 def test_predict(ahead_ms: int, silent_ms: int) -> None:
     """On the held sample, coasting, and one after the other."""
-    layout, state = plan(config()), running_state(np.random.default_rng(2))
+    layout, state = make_parameters(config()), running_state(np.random.default_rng(2))
     state.stamps[T_IMU] = T0 - silent_ms * MS
     other = state.copy()
     make_kernel(layout, True).predict(state, T0 + ahead_ms * MS)
@@ -170,7 +170,7 @@ def test_predict(ahead_ms: int, silent_ms: int) -> None:
 def test_predict_leaves_a_state_that_does_not_run() -> None:
     state = FilterState(7)
     before = state.numbers.copy()
-    make_kernel(plan(config()), True).predict(state, T0)
+    make_kernel(make_parameters(config()), True).predict(state, T0)
     np.testing.assert_array_equal(state.numbers, before)
 
 
@@ -238,7 +238,7 @@ def test_every_measurement(kind: str, correlation_s: float, wide: bool) -> None:
         ]
         fusion, _ = both(settings, state, [*events, sample(T0 + 10 * MS, rng), sample(T0 + 20 * MS, rng)])
         rows = fusion.history.rows
-        seen |= set(rows["outcome"][rows["source"] == fusion.plan.sources.index(KINDS[kind])].tolist())
+        seen |= set(rows["outcome"][rows["source"] == fusion.params.sources.index(KINDS[kind])].tolist())
     assert seen == {Outcome.REJECTED} if "vertical" in kind else Outcome.FUSED in seen
 
 
@@ -378,7 +378,7 @@ def both_kernels(
 def reset_by(fusion: Fusion) -> tuple[int, ResetReason, str]:
     """Number of resets; the last one's reason, and its source."""
     stamps = fusion.history.head.stamps
-    return int(stamps[RESETS]), ResetReason(int(stamps[RESET_REASON])), fusion.plan.sources[int(stamps[RESET_SOURCE])]
+    return int(stamps[RESETS]), ResetReason(int(stamps[RESET_REASON])), fusion.params.sources[int(stamps[RESET_SOURCE])]
 
 
 def departing(heading: float, seconds: float, speed: float = 6.0) -> Drive:
@@ -460,7 +460,7 @@ def test_all_that_can_be_learnt() -> None:
     )
     fusion = both_kernels(settings, sorted(events + pressure + yaws, key=lambda event: event.key))
     sigma = np.sqrt(np.diag(fusion.history.head.covariance))
-    assert fusion.plan.size == WIDE_SIZE
+    assert fusion.params.size == WIDE_SIZE
     assert sigma[HEIGHT_OFFSET_ERROR][0] < 3.0  # of 100 m
     assert sigma[DELAYS_ERROR][0] < 0.1
     assert fusion.outcomes()["front_left"]["FUSED"] > 40
@@ -624,17 +624,17 @@ def test_sizes() -> None:
     from fusiond.filter.kernel import narrow, wide  # noqa: PLC0415 - only where they were built
 
     with pytest.raises(ValueError, match="18 error states, not 27"):
-        narrow.Kernel(plan(config(gnss=LEARNT)))
+        narrow.Kernel(make_parameters(config(gnss=LEARNT)))
     with pytest.raises(ValueError, match="27 error states, not 18"):
-        wide.Kernel(plan(config()))
-    kernel = make_kernel(plan(config()), True)
+        wide.Kernel(make_parameters(config()))
+    kernel = make_kernel(make_parameters(config()), True)
     with pytest.raises(ValueError, match="numbers"):
         kernel.predict(FilterState(2), T0)
     with pytest.raises(ValueError, match="18 error states is needed, not 27"):
-        kernel.answer(np.zeros(NOMINAL_SIZE), np.zeros((27, 27)))
+        kernel.to_north_east_down(np.zeros(NOMINAL_SIZE), np.zeros((27, 27)))
     assert compiled_available()
-    assert isinstance(make_kernel(plan(config()), False), Kernel)
-    assert not isinstance(make_kernel(plan(config())), Kernel)
+    assert isinstance(make_kernel(make_parameters(config()), False), Kernel)
+    assert not isinstance(make_kernel(make_parameters(config())), Kernel)
 
 
 CHILD = """

@@ -80,7 +80,7 @@ def ordered(events: list[Measurement]) -> list[Measurement]:
 
 def offset_of(fusion: Fusion) -> tuple[float, float]:
     """The height offset and its sigma [m]."""
-    return calibrations(fusion.plan, fusion.history.head)["height_offset_m"]
+    return calibrations(fusion.params, fusion.history.head)["height_offset_m"]
 
 
 def test_values_and_parameters() -> None:
@@ -202,5 +202,5 @@ def test_shuffled_arrivals_give_the_same_bits(compiled: bool) -> None:
 
 def test_a_barometer_widens_the_state() -> None:
     fusion = Fusion(settings(), compiled_available())
-    assert fusion.plan.size == WIDE_SIZE
-    assert fusion.plan.calibration_variances[-1] == 100.0 * 100.0
+    assert fusion.params.size == WIDE_SIZE
+    assert fusion.params.calibration_variances[-1] == 100.0 * 100.0

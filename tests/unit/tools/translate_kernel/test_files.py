@@ -18,7 +18,7 @@ import math
 from enum import IntEnum
 import numpy as np
 from fusiond.filter.observations.model import Observation
-from fusiond.filter.parameters import Plan
+from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Row
 from fusiond.filter.state import FilterState
 from fusiond.maths.typed import Covariance, ErrorVector, Matrix3, Quaternion, Stamps, Vector, Vector3, compiled
@@ -225,9 +225,9 @@ def test_tuples(translate: Translate) -> None:
 def test_loops(translate: Translate) -> None:
     found = translate("""
         @compiled
-        def count(stamps: Stamps, plan: Plan, state: FilterState) -> int:
+        def count(stamps: Stamps, params: Parameters, state: FilterState) -> int:
             total = 0
-            for source in plan.wheels:
+            for source in params.wheels:
                 if stamps[source] < 0:
                     continue
                 total += stamps[source]
@@ -242,14 +242,14 @@ def test_loops(translate: Translate) -> None:
     same(
         found,
         """
-        cdef int64_t small_count(int64_t* stamps, Plan* plan, State* state) noexcept nogil:
+        cdef int64_t small_count(int64_t* stamps, Parameters* params, State* state) noexcept nogil:
             cdef int64_t total
             cdef int64_t source
             cdef int64_t _k1
             cdef int64_t i
             total = 0
-            for _k1 in range(plan.wheels_count):
-                source = plan.wheels[_k1]
+            for _k1 in range(params.wheels_count):
+                source = params.wheels[_k1]
                 if (stamps[source] < 0):
                     continue
                 total += stamps[source]
@@ -352,8 +352,8 @@ REFUSED = {
     "a sum of matrices": ("p[0] = (p + p)[0]", "no arithmetic with this"),
     "a matrix assigned": ("p[:] = p", "a matrix is filled by a number only"),
     "a vector of no known length": ("values *= 2.0", "how long is this?"),
-    "a loop over a vector": ("for x in v * 2.0:\n        pass", "a loop goes over a range or a list of the plan"),
-    "a loop with two names": ("for a, b in plan.wheels:\n        pass", "a loop has one name and no else"),
+    "a loop over a vector": ("for x in v * 2.0:\n        pass", "a loop goes over a range or a list of the parameters"),
+    "a loop with two names": ("for a, b in params.wheels:\n        pass", "a loop has one name and no else"),
     "for and else": ("for k in range(3):\n        pass\n    else:\n        pass", "a loop has one name and no else"),
     "while and else": ("while i > 0:\n        break\n    else:\n        pass", "a loop has no else"),
     "an exception": ("raise ValueError", "no translation of this statement"),
@@ -375,7 +375,8 @@ def test_what_has_no_translation(translate: Translate, body: str, reason: str) -
     source = (
         "@compiled\ndef double(v: Vector3) -> Vector3:\n    return v * 2.0\n"
         "def helper(v: Vector3) -> None:\n    pass\n"
-        "@compiled\ndef use(state: FilterState, plan: Plan, p: Covariance, v: Vector3, values: Vector, i: int) -> None:\n"
+        "@compiled\ndef use(state: FilterState, params: Parameters, p: Covariance, v: Vector3, values: Vector, i: int)"
+        " -> None:\n"
         f"    {body}\n"
     )
     with pytest.raises(UntranslatableError) as refused:
