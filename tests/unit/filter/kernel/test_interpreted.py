@@ -367,7 +367,7 @@ def both_kernels(
             same_bits(first, second)
             ahead = event.t_ns + number % 7 * 50 * MS
             estimates = first.solution_at(ahead), second.solution_at(ahead)
-            same_state(first._carried, second._carried)
+            same_state(first._predicted, second._predicted)
             assert estimates[0].mode is estimates[1].mode
             assert (estimates[0].state is None) == (estimates[1].state is None)
     assert first.history.rerun == second.history.rerun
