@@ -14,7 +14,20 @@ from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.filter.rows import ROW, Outcome
-from fusiond.filter.state import ERROR_SIZE, PHASE, POSITION_E, QUATERNION_EB, RUNNING, VELOCITY_E, FilterState, T
+from fusiond.filter.state import (
+    ERROR_SIZE,
+    PHASE,
+    POSITION_E,
+    QUATERNION_EB,
+    RESET_REASON,
+    RESET_SOURCE,
+    RESETS,
+    RUNNING,
+    VELOCITY_E,
+    FilterState,
+    ResetReason,
+    T,
+)
 from fusiond.maths.rotation import matrix_from_euler, quaternion
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import EARTH_RATE, ecef, geodetic, gravity_e, mat_ne, radii
@@ -214,6 +227,18 @@ def same_bits(a: Fusion, b: Fusion) -> None:
     first, second = (h.rows[h.rows["t_ns"] >= limit] for h in (a.history, b.history))
     for column in ("t_ns", "source", "sequence", "outcome", "values", "innovation", "variance", "ratio"):
         np.testing.assert_array_equal(first[column], second[column], err_msg=column)
+
+
+def same_state(a: FilterState, b: FilterState) -> None:
+    """Assert that two states hold the same bits."""
+    np.testing.assert_array_equal(bits(a.numbers), bits(b.numbers))
+    np.testing.assert_array_equal(a.whole, b.whole)
+
+
+def reset_by(fusion: Fusion) -> tuple[int, ResetReason, str]:
+    """Number of resets; the last one's reason, and its source."""
+    stamps = fusion.history.head.stamps
+    return int(stamps[RESETS]), ResetReason(int(stamps[RESET_REASON])), fusion.params.sources[int(stamps[RESET_SOURCE])]
 
 
 def bits(numbers: Array) -> np.ndarray:

@@ -22,6 +22,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "filter/observations/test_observations.py": "every observation model of the table",
     "filter/test_closed_forms.py": "decisions of the filter against the closed forms of tests/oracles",
     "filter/kernel/test_generated.py": "what tools/translate_kernel made, against what it would make",
+    "filter/kernel/test_whole_drives.py": "both kernels over whole drives",
     "timeline/test_clock_jumps.py": "timeline/clock.py and aligner.py when clocks jump, stray, stall and reboot",
 }
 FILES = sorted(path for path in UNIT.rglob("test_*.py") if path.parent.name != "project")

@@ -1,5 +1,5 @@
-"""The compiled and the interpreted kernel give the same bits: operation by operation, and over drives that reach every
-branch; and the compiled one gives them on every processor."""
+"""The compiled and the interpreted kernel give the same bits, operation by operation; and the compiled one gives them on
+every processor."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ import pickle
 import platform
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
-from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Measurement, Payload, Pressure, WheelSpeed
+from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.filter.kernel.interpreted import Kernel, compiled_available, make_kernel
 from fusiond.filter.measurement import SUSPECT
 from fusiond.filter.north_east_down import COVARIANCE_N, GEODETIC, QUATERNION_NB, VELOCITY_N
@@ -27,12 +25,8 @@ from fusiond.filter.observations.model import mat_eb
 from fusiond.filter.parameters import make_parameters
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
-    BLOWN,
-    CHOOSING,
     CONSTRAINT_FUSED,
-    DELAYS_ERROR,
     ERROR_SIZE,
-    HEIGHT_OFFSET_ERROR,
     MEAN_FORCE_B,
     MEAN_RATE_B,
     MEAN_WEIGHT,
@@ -42,9 +36,6 @@ from fusiond.filter.state import (
     POSITION_E,
     QUATERNION_EB,
     RATE_B,
-    RESET_REASON,
-    RESET_SOURCE,
-    RESETS,
     RUNNING,
     SCATTER_FORCE,
     SCATTER_RATE,
@@ -52,47 +43,34 @@ from fusiond.filter.state import (
     T_LAST,
     T_REJECTED,
     T_SAME_ERROR,
-    T_START,
     T_STILL,
     VELOCITY_E,
     WIDE_SIZE,
     FilterState,
     ResetReason,
-    Verdict,
 )
-from fusiond.filter.step import LOST_HEADING, yaw_variance
-from fusiond.filter.stored_state import StoredState
 from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.paths import ROOT
 from tests.helpers.streams import (
     MS,
-    PULLS_AWAY_S,
     SECOND,
     T0,
-    WHEELS,
-    Drive,
     apply,
     bits,
     config,
-    drive,
     fuse,
     measurements,
-    ramp,
+    reset_by,
     running_state,
     same_bits,
+    same_state,
     town,
 )
 
 pytestmark = needs_compiled
 LEARNT = {"lever_arm_sigma_m": 0.3, "delay_sigma_ms": 100.0, "velocity_delay_sigma_ms": 50.0}
-
-
-def same_state(a: FilterState, b: FilterState) -> None:
-    """Assert that two states hold the same bits."""
-    np.testing.assert_array_equal(bits(a.numbers), bits(b.numbers))
-    np.testing.assert_array_equal(a.whole, b.whole)
 
 
 def sample(t_ns: int, rng: np.random.Generator) -> Measurement:
@@ -332,291 +310,6 @@ def test_constraints(still: bool) -> None:
         fusion, _ = both(settings, state, [event])
         fused.append(fusion.history.head.stamps[CONSTRAINT_FUSED].tolist())
     assert np.array(fused).sum(axis=0).astype(bool).tolist() == [not still, still, still]
-
-
-# --- Whole drives
-
-HEADED = {"heading_deg": math.degrees(0.7)}
-Change = Callable[[Measurement, float], Payload | None]  # by the seconds since the begin; None: it is missing
-
-
-def sensed(truth: Drive, change: Change = lambda event, _: event.payload, **options: Any) -> list[Measurement]:
-    """What the sensors say of a drive at 25 Hz, wheels and GNSS at 5 Hz, in the order of the stamps."""
-    held = []
-    for event in measurements(truth, **{"wheel_hz": 5.0} | options):
-        payload = change(event, (event.t_ns - T0) / SECOND)
-        if payload is not None:
-            held.append(msgspec.structs.replace(event, payload=payload))
-    return held
-
-
-def both_kernels(
-    settings: Config,
-    events: list[Measurement],
-    stored: StoredState | None = None,
-    poison: Callable[[FilterState, int], None] = lambda head, number: None,
-) -> Fusion:
-    """Both kernels over events in the order of arrival. Often, and at the end, all that they hold is asserted to be the same
-    bits, and what is published ahead. `poison` may spoil a state before an event. Returns the filter that runs compiled."""
-    first, second = Fusion(settings, True, stored), Fusion(settings, False, stored)
-    for number, event in enumerate(events):
-        for fusion in (first, second):
-            poison(fusion.history.head, number)
-            fusion.fuse(event)
-        if number % 40 == 0 or number == len(events) - 1:
-            same_bits(first, second)
-            ahead = event.t_ns + number % 7 * 50 * MS
-            estimates = first.solution_at(ahead), second.solution_at(ahead)
-            same_state(first._predicted, second._predicted)
-            assert estimates[0].mode is estimates[1].mode
-            assert (estimates[0].state is None) == (estimates[1].state is None)
-    assert first.history.rerun == second.history.rerun
-    assert first.history.head.stamps[PHASE] == RUNNING
-    return first
-
-
-def reset_by(fusion: Fusion) -> tuple[int, ResetReason, str]:
-    """Number of resets; the last one's reason, and its source."""
-    stamps = fusion.history.head.stamps
-    return int(stamps[RESETS]), ResetReason(int(stamps[RESET_REASON])), fusion.params.sources[int(stamps[RESET_SOURCE])]
-
-
-def departing(heading: float, seconds: float, speed: float = 6.0) -> Drive:
-    """Stands, pulls away after 3 s and weaves a little."""
-    return drive(
-        seconds,
-        lambda t: speed * ramp(t, PULLS_AWAY_S, 3.0),
-        lambda t: heading + 0.2 * np.sin(0.5 * t) * ramp(t, PULLS_AWAY_S, 3.0),
-        rate=25.0,
-    )
-
-
-@pytest.mark.parametrize("speed", [6.0, -3.0])
-def test_a_heading_is_chosen(speed: float) -> None:
-    """The bank stands, rolls, and bridges a hole in the IMU's data; duplicates and outliers come meanwhile."""
-
-    def change(event: Measurement, t: float) -> Payload | None:
-        if event.source == "imu0" and 3.3 < t < 3.7:
-            return None
-        return GnssVelocity(40.0, 0.0, 0.0) if event.source == "gps0.velocity" and event.sequence == 11 else event.payload
-
-    events = sensed(departing(4.0, 6.5, speed), change)
-    events += [msgspec.structs.replace(event, sequence=event.sequence + 10**6) for event in events[::9]]
-    settings = config(filter={"heading_spread_deg": 4.0})
-    events.sort(key=lambda event: event.key)
-    for until_s, stands in ((2.9, True), (4.0, False)):
-        early = fuse(settings, [event for event in events if event.t_ns < T0 + until_s * SECOND], True).history.head
-        assert (early.stamps[PHASE], early.stamps[T_STILL] != NEVER) == (CHOOSING, stands)
-    fusion = both_kernels(settings, events)
-    assert fusion.history.head.stamps[T_START] < T0 + 2 * SECOND
-    assert fusion.totals()["DUPLICATE"] > 20
-
-
-def kept(heading: float) -> StoredState:
-    """What a vehicle leaves that stood there, facing otherwise than it does now."""
-    fusion = fuse(config(filter={"heading_deg": math.degrees(heading)}), sensed(departing(heading, 3.0)), True)
-    stored = fusion.to_store()
-    assert stored is not None
-    return msgspec.structs.replace(stored, t_ns=T0 - SECOND)
-
-
-def test_a_hot_start_that_the_drive_contradicts() -> None:
-    fusion = both_kernels(config(), sensed(departing(2.0, 7.0)), kept(0.5))
-    assert fusion.hot_start() is Verdict.USED
-    assert reset_by(fusion)[:2] == (1, ResetReason.HEADING_DECIDED)
-
-
-def test_all_that_can_be_learnt() -> None:
-    """Lever arm, delays, a scale for each wheel, the barometer's offset; fixes weighed as a mixture; steered wheels with a
-    sign; velocities of two axes and of three; a dual-antenna receiver; readings whose errors are correlated."""
-
-    def change(event: Measurement, t: float) -> Payload | None:
-        payload = event.payload
-        if isinstance(payload, GnssPosition | GnssVelocity) and t < 2.0:
-            return None
-        if isinstance(payload, WheelSpeed):
-            return WheelSpeed(-payload.speed)
-        if isinstance(payload, GnssPosition) and t > 11.0:
-            return msgspec.structs.replace(payload, latitude=payload.latitude + 1e-3)
-        if isinstance(payload, GnssVelocity) and event.sequence % 3 == 0:
-            return GnssVelocity(payload.north, payload.east, None, payload.sigma)
-        if isinstance(payload, GnssPosition) and event.sequence % 10 == 7:
-            return msgspec.structs.replace(payload, latitude=payload.latitude + 1e-5 * (event.sequence % 4))
-        return payload
-
-    events = sensed(departing(0.7, 12.0, -4.0), change)
-    pressure = [
-        Measurement(T0 + 7 * MS + k * 200 * MS, "baro", k, T0, Pressure(95_000.0 + 3.0 * math.sin(k), 290.0))
-        for k in range(60)
-    ]
-    gnss = LEARNT | {"outliers": "mixture", "lever_arm_m": (0.5, 0.2, -1.0), "position_correlation_s": 0.5}
-    yaws = [Measurement(T0 + 3 * MS + k * 200 * MS, "yaw0", k, T0, GnssYaw(0.7, 0.01)) for k in range(60)]
-    settings = config(
-        filter=HEADED | {"wheel_scale_by": "wheel"},
-        dual_antenna={"yaw0": {"link": "link", "offset_deg": 2.0}},
-        gnss=gnss | {"group": "roof", "shared_sigma_m": 0.5},
-        wheel={"unsigned": False, "steered": True, "position_m": (1.2, 0.8, 0.3), "correlation_s": 0.2},
-        barometer={"baro": {"link": "link", "sigma_m": 0.5}},
-    )
-    fusion = both_kernels(settings, sorted(events + pressure + yaws, key=lambda event: event.key))
-    sigma = np.sqrt(np.diag(fusion.history.head.covariance))
-    assert fusion.params.size == WIDE_SIZE
-    assert sigma[HEIGHT_OFFSET_ERROR][0] < 3.0  # of 100 m
-    assert sigma[DELAYS_ERROR][0] < 0.1
-    assert fusion.outcomes()["front_left"]["FUSED"] > 40
-    assert fusion.outcomes()["yaw0"]["FUSED"] > 10
-
-
-def test_an_imu_that_falls_silent() -> None:
-    """At rest and in motion; briefly, and until the heading is lost; then the filter aligns anew."""
-    truth = drive(14.0, lambda t: 10.0 * ramp(t, 4.0, 3.0), lambda t: 0.7 + 0.15 * np.clip(t - 5.0, 0.0, None), rate=25.0)
-    holes = [(2.0, 3.0), (5.0, 5.3), (8.0, 10.0)]
-
-    def change(event: Measurement, t: float) -> Payload | None:
-        return None if event.source == "imu0" and any(begin < t < end for begin, end in holes) else event.payload
-
-    events = sensed(truth, change)
-    lost = fuse(config(filter=HEADED), [event for event in events if event.t_ns < T0 + 9.9 * SECOND], True)
-    assert yaw_variance(lost.history.head) > LOST_HEADING**2
-    assert reset_by(lost)[0] == 0  # the hole at rest cost nothing
-    assert reset_by(both_kernels(config(filter=HEADED), events))[:2] == (1, ResetReason.HEADING_LOST)
-
-
-def test_a_frozen_imu() -> None:
-    """It repeats one sample for two seconds: the filter coasts, and takes it again when it lives."""
-    held: dict[str, Payload] = {}
-
-    def change(event: Measurement, t: float) -> Payload:
-        if event.source == "imu0" and not 7.0 < t < 9.0:
-            held["imu0"] = event.payload
-        return held["imu0"] if event.source == "imu0" else event.payload
-
-    events = sensed(town(12.0, rate=25.0), change)
-    frozen = fuse(config(filter=HEADED), [event for event in events if event.t_ns < T0 + 9 * SECOND], True)
-    assert frozen.health(T0 + 9 * SECOND)["imu0"].status == "frozen"
-    fusion = both_kernels(config(filter=HEADED), events)
-    assert fusion.health(T0 + 12 * SECOND)["imu0"].status == "nominal"
-
-
-@pytest.mark.parametrize("before", ["imu0", "gps0.position"])
-@pytest.mark.parametrize(("part", "place"), [("nominal", 4), ("nominal", 11), ("covariance", 0)])
-def test_a_state_that_is_not_finite(part: str, place: int, before: str) -> None:
-    """Velocity, gyro bias, a variance: spoilt before one event of a source, after the filter has run for long."""
-    truth = drive(8.0, lambda t: 10.0 + 0 * t, lambda t: 0.7 + 0 * t, rate=25.0)
-    events = sensed(truth, wheels=())
-    when = next(i for i, event in enumerate(events) if event.source == before and event.t_ns > T0 + 3 * SECOND)
-
-    def poison(head: FilterState, number: int) -> None:
-        if number == when:
-            getattr(head, part).flat[place] = math.nan
-
-    with np.errstate(invalid="ignore"):
-        fusion = both_kernels(config((), filter=HEADED), events, poison=poison)
-    assert reset_by(fusion)[:2] == (1, ResetReason.NOT_FINITE)
-    assert fusion.history.head.stamps[BLOWN] == 1
-
-
-def test_sources_that_are_locked_out() -> None:
-    """Position, velocity and height offset are put where their source says, after it was rejected for long."""
-
-    def change(event: Measurement, t: float) -> Payload:
-        payload = event.payload
-        if isinstance(payload, GnssPosition) and t > 6.0:
-            return msgspec.structs.replace(payload, latitude=payload.latitude + 1e-5)
-        if isinstance(payload, GnssVelocity) and t > 9.0:
-            return msgspec.structs.replace(payload, north=payload.north + 6.0)
-        return payload
-
-    events = sensed(town(15.0, rate=25.0), change, wheels=())
-    events += [
-        Measurement(T0 + 7 * MS + k * 200 * MS, "baro", k, T0, Pressure(95_000.0 if k < 40 else 94_000.0, 290.0))
-        for k in range(75)
-    ]
-    settings = config(
-        (),
-        filter=HEADED | {"gnss_reset_s": 0.7, "gnss_return_s": 0.5},
-        motion={"non_holonomic": False},
-        barometer={"baro": {"link": "link", "sigma_m": 0.5}},
-    )
-    events.sort(key=lambda event: event.key)
-    early = fuse(settings, [event for event in events if event.t_ns < T0 + 9 * SECOND], True)
-    assert reset_by(early) == (1, ResetReason.SOURCE_RETURNED, "gps0.position")
-    fusion = both_kernels(settings, events)
-    assert reset_by(fusion)[0] > 1
-    assert fusion.outcomes()["gps0.velocity"]["REJECTED"] > 10
-    assert fusion.outcomes()["baro"]["FUSED"] > 60
-    assert fusion.outcomes()["baro"]["REJECTED"] > 2
-
-
-def test_faulty_sources() -> None:
-    """One wheel slips, one repeats its reading, one is noisy; GNSS is away for longer than an outage, and comes back off."""
-    noise = np.random.default_rng(8)
-
-    def change(event: Measurement, t: float) -> Payload | None:
-        payload = event.payload
-        if isinstance(payload, GnssPosition | GnssVelocity) and 12.0 < t < 23.0:
-            return None
-        if isinstance(payload, GnssPosition) and t > 23.0:
-            return msgspec.structs.replace(payload, latitude=payload.latitude + 3e-6)
-        if isinstance(payload, WheelSpeed) and t > 8.0:
-            wrong = {
-                "rear_left": 1.3 * payload.speed,
-                "front_right": 9.0,
-                "front_left": abs(payload.speed + float(noise.normal(0.0, 0.35))),
-            }
-            return WheelSpeed(wrong.get(event.source, payload.speed))
-        return payload
-
-    fusion = both_kernels(config(filter=HEADED, wheel={"noise_most": 1.5}), sensed(town(28.0, rate=25.0), change))
-    found = fusion.health(T0 + 28 * SECOND)
-    assert {source: found[source].status for source in WHEELS} == {
-        "rear_left": "biased",
-        "front_right": "frozen",
-        "front_left": "noisy",
-        "rear_right": "nominal",
-    }
-
-
-@pytest.mark.parametrize("heading", [HEADED, {}], ids=["given", "chosen"])
-def test_a_vehicle_that_is_carried(heading: dict[str, float]) -> None:
-    """A ferry: wheels at rest while GNSS sees the vehicle move."""
-    truth = drive(9.0, lambda t: 5.0 * ramp(t, 2.0, 4.0), lambda t: 0.7 + 0.1 * t, rate=25.0)
-    settings = config(filter=heading | {"gnss_reset_s": 2.0, "gnss_return_s": 1.0})
-    fusion = both_kernels(
-        settings, sensed(truth, lambda event, _: WheelSpeed(0.0) if isinstance(event.payload, WheelSpeed) else event.payload)
-    )
-    assert fusion.outcomes()["rear_left"]["REJECTED"] > 3
-    assert np.linalg.norm(fusion.history.head.nominal[VELOCITY_E]) > 4.0
-
-
-def test_a_hole_in_all_data() -> None:
-    truth = drive(3.0, lambda t: 12.0 + 0 * t, lambda t: 0.7 + 0 * t, rate=25.0)
-    events, shift = sensed(truth), 40 * SECOND
-    again = [
-        msgspec.structs.replace(event, t_ns=event.t_ns + shift, t_receive_ns=event.t_receive_ns + shift) for event in events
-    ]
-    assert reset_by(both_kernels(config(), events + again))[:2] == (1, ResetReason.DATA_GAP)
-
-
-@pytest.mark.parametrize("settings", [config(), config(filter={"heading_deg": 40.0})], ids=["course", "given"])
-def test_events_out_of_order(settings: Config) -> None:
-    """A start, outliers, duplicates, a hole in the IMU's data, and fixes that come late and rewind."""
-    rng, held = np.random.default_rng(7), []
-    for event in sensed(town(16.0, rate=25.0), wheel_hz=12.0):
-        if event.source == "imu0" and 12 * SECOND < event.t_ns - T0 < 12.5 * SECOND:
-            continue
-        chance, payload = rng.random(), event.payload
-        if chance < 0.05 and isinstance(payload, WheelSpeed):
-            payload = WheelSpeed(payload.speed + 3.0)
-        if chance < 0.1 and isinstance(payload, GnssPosition):
-            payload = GnssPosition(payload.latitude + 1e-5, payload.longitude, payload.height)
-        held.append(msgspec.structs.replace(event, payload=payload))
-        if chance > 0.98:
-            held.append(msgspec.structs.replace(event, sequence=event.sequence + 10**6))
-    late = sorted(held, key=lambda event: (event.t_ns + 120 * MS * event.source.startswith("gps0"), event.key))
-    fusion = both_kernels(settings, late)
-    assert all(fusion.totals()[name] > 0 for name in ("FUSED", "REJECTED", "DUPLICATE"))
-    assert fusion.history.rerun > 20
 
 
 def test_sizes() -> None:
