@@ -116,9 +116,9 @@ def random_messages(count: int) -> list[StateMessage]:
         values |= {name: tuple(random.normal(size=size).tolist()) for name, size in VECTORS.items()}
         return SolutionState(covariance=root @ root.T, **values)
 
-    def told(number: int) -> Solution:
+    def published(number: int) -> Solution:
         t_ns = 1_700_000_000_000_000_001 + number * 20_000_000
         mode = Mode.NOMINAL if number else Mode.ALIGNING
         return Solution(t_ns, mode, 3_000_001, 0, state() if number else None)
 
-    return [state_message(told(number), "rover", OutcomeCounts(fused=number)) for number in range(count)]
+    return [state_message(published(number), "rover", OutcomeCounts(fused=number)) for number in range(count)]

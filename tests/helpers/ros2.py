@@ -15,7 +15,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 T0 = 1_700_000_000 * SECOND
 
 
-def told(number: int = 1, mode: Mode = Mode.NOMINAL, **given: Any) -> StateMessage:
+def state_numbered(number: int = 1, mode: Mode = Mode.NOMINAL, **given: Any) -> StateMessage:
     values: dict[str, Any] = {"state": random_state(number), "age_ms": 1.0, "resets": 0, **given}
     t_ns = T0 + 7 + number * 20_000_000
     return StateMessage(vehicle="rover", t_ns=t_ns, mode=mode, outcomes=OutcomeCounts(), **values)

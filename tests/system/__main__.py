@@ -53,7 +53,7 @@ PYTHONDONTWRITEBYTECODE=1 exec /opt/fusiond/bin/python checks.py "$PWD"
 
 
 def unfit() -> str | None:
-    """Why `--here` cannot be, if so."""
+    """Why `--here` is impossible; None if it is possible."""
     if os.geteuid() != 0:
         return "it takes root"
     if Path("/proc/1/comm").read_text().strip() != "systemd":
@@ -75,7 +75,7 @@ def make_package() -> Path:
 
 
 def make_drive(folder: Path) -> None:
-    """A simulated drive of seven minutes, round and round."""
+    """A simulated drive of seven minutes in circles."""
     folder.mkdir()
     segments = (f"[[segment]]\nduration_s = {s}\nspeed_mps = {v}.0\nturn_deg = {t}.0\n" for s, v, t in AWAY + ROUND * 13)
     (folder / "scenario.toml").write_text(SCENARIO + "".join(segments))
@@ -84,7 +84,7 @@ def make_drive(folder: Path) -> None:
 
 
 def make_job(job: Path, package: Path) -> None:
-    """All that the checks need, in a folder."""
+    """Everything that the checks need, in a folder."""
     make_drive(job / "drive")
     for name in ("checks.py", "bench.py", "faults.py", "reader.py", "vehicle.py"):
         shutil.copy2(Path(__file__).parent / name, job)
@@ -111,7 +111,7 @@ def table(job: Path) -> str:
 
 
 def run(here: bool) -> int:
-    """All of it; the exit status. Raises Unavailable."""
+    """Run all checks; returns the exit status. Raises Unavailable."""
     if here and (reason := unfit()):
         raise guest.Unavailable(f"not on this machine: {reason}")
     began = time.monotonic()
@@ -133,7 +133,7 @@ def run(here: bool) -> int:
 
 
 def main() -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m tests.system", description=__doc__.split("\n\n")[0])
     parser.add_argument("--here", action="store_true", help="on this machine itself, which may be harmed")
     try:

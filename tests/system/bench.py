@@ -1,4 +1,4 @@
-"""What the system tests' checks share: the service on its drive, its reader, and what systemd says of it."""
+"""The parts shared by the checks: the service on its drive, its reader, and its status in systemd."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ INTERFACE, BOX = "vcan0", Path("/var/lib/fusiond/box")
 
 
 class Failed(Exception):
-    """A check did not hold; the message says what was found."""
+    """A check failed; the message says why."""
 
 
 def call(*command: str, check: bool = True) -> str:
@@ -39,7 +39,7 @@ def call(*command: str, check: bool = True) -> str:
 
 
 def wait(what: str, condition: Callable[[], bool], timeout_s: float = DEADLINE_S, look_s: float = 0.01) -> float:
-    """Wait until something holds; how long that took [s]. Raises Failed."""
+    """Wait until a condition holds; returns the time it took [s]. Raises Failed."""
     began = time.monotonic()
     while not condition():
         if time.monotonic() - began > timeout_s:
@@ -57,7 +57,7 @@ def is_gone(pid: int) -> bool:
 
 
 def libraries_s() -> float:
-    """How long this machine takes to import the service's libraries: how fast it is."""
+    """Time that this machine takes to import the service's libraries: a measure of its speed."""
     began = time.monotonic()
     call(sys.executable, "-c", LIBRARIES)
     return time.monotonic() - began
@@ -91,13 +91,13 @@ class Bench:
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def journal(self, since: float) -> str:
-        """What the service said since an instant of the monotonic clock."""
+        """The service's log since an instant of the monotonic clock."""
         lines = call("journalctl", "--unit", self.unit, "--output", "short-monotonic", "--no-pager", "--boot")
         stamped = ((re.match(r"\[\s*([\d.]+)\]", line), line) for line in lines.splitlines())
         return "\n".join(line for stamp, line in stamped if stamp and float(stamp[1]) >= since)
 
     def error_m(self, message: dict[str, Any]) -> float | None:
-        """How far a state lies from where the vehicle was at its instant, which is of the wall clock at the start."""
+        """Distance of a state from the vehicle at its instant [m]; instants count from the wall clock at the start."""
         return self.truth.error_m(message["t_ns"] - self.vehicle.start_unix_ns + self.vehicle.begin_ns, message)
 
     def is_sane(self, message: dict[str, Any]) -> bool:
@@ -106,7 +106,7 @@ class Bench:
         return message["mode"] == "nominal" and error is not None and error < SANE_M
 
     def errors(self, since_ns: int, until_ns: int) -> list[float]:
-        """The errors of the states that came between two instants [m]. Raises Failed where there are none."""
+        """The errors of the states that came between two instants [m]. Raises Failed if there are none."""
         arrivals = self.reader.since(since_ns, until_ns)
         found = [self.error_m(arrival.decoded()) for arrival in arrivals[:: max(1, len(arrivals) // 200)]]
         errors = [error for error in found if error is not None]
@@ -115,16 +115,16 @@ class Bench:
         return errors
 
     def fused_hz(self, seconds: float = 1.0) -> float:
-        """Measurements fused a second, as told by the states of the last moments."""
+        """Measurements fused per second, by the latest states."""
         arrivals = self.reader.since(time.monotonic_ns() - round(seconds * SECOND))
         if len(arrivals) < 2:
             return 0.0
         fused = arrivals[-1].decoded()["outcomes"]["fused"] - arrivals[0].decoded()["outcomes"]["fused"]
         return float(fused * SECOND / (arrivals[-1].t_ns - arrivals[0].t_ns))
 
-    def steady(self, since_ns: int, restarts: int, most_m: float = SANE_M) -> str:
-        """Hold that since an instant nothing restarted, states came without a gap and were right to `most_m`, and that
-        they are right now. What was found."""
+    def steady(self, since_ns: int, restarts: int, max_m: float = SANE_M) -> str:
+        """Check that since an instant nothing restarted, states came without a gap with errors below `max_m`, and that they
+        are right now. Returns the figures."""
         first = self.reader.first(time.monotonic_ns(), self.is_sane, DEADLINE_S)
         if first is None:
             raise Failed(f"no sane state within {DEADLINE_S:g} s; {self.describe()}")
@@ -134,7 +134,7 @@ class Bench:
             raise Failed(f"{self.restarts - restarts} restart(s); {self.describe()}")
         if gap > STEADY_GAP_S:
             raise Failed(f"silent for {gap:.2f} s")
-        if max(errors) > most_m:
+        if max(errors) > max_m:
             raise Failed(f"{max(errors):.1f} m off")
         return f"longest gap {1000 * gap:.0f} ms, error median {statistics.median(errors):.2f} m, most {max(errors):.2f} m"
 
@@ -143,7 +143,7 @@ class Bench:
         return int(self.reader.arrivals[-1].decoded()["outcomes"]["fused"])
 
     def back(self, killed_ns: int, fused: int) -> str:
-        """Hold that a killed service, which had fused so much, publishes again soon, and then sanely. What was found."""
+        """Check that a killed service publishes again soon, and that its states are right. Returns the figures."""
         again = self.reader.first(killed_ns, lambda message: message["outcomes"]["fused"] < fused, DEADLINE_S)
         if again is None:
             raise Failed(f"nothing published within {DEADLINE_S:g} s; {self.describe()}")
@@ -157,7 +157,7 @@ class Bench:
         return f"{found}, nominal after {nominal:.2f} s"
 
     def describe(self) -> str:
-        """For a failure."""
+        """Details for the report of a failure."""
         last = self.reader.arrivals[-1].decoded() if self.reader.arrivals else {}
         error = self.error_m(last) if last else None
         return f"status {self.show('StatusText')!r}, last mode {last.get('mode')}, error {error}, fault {last.get('fault')}"

@@ -34,7 +34,7 @@ EXPOSURE = 2.0  # the most that systemd may find
 TRACE_RMSE_M = 1.0  # of the captured trace: 0.31 m replayed
 READY_S = 15.0
 MISSING_SHARE = 0.02  # of the states: a reader that is slow on a slow machine
-STOOD_STILL_S = 1.0  # a machine that did so long tells nothing about the service
+STOOD_STILL_S = 1.0  # a machine that stopped for this long says nothing about the service
 
 
 class Check(NamedTuple):
@@ -46,13 +46,13 @@ class Check(NamedTuple):
 
 
 class Checks:
-    """Runs checks and keeps what they found."""
+    """Runs checks and keeps their results."""
 
     def __init__(self) -> None:
         self.done: list[Check] = []
 
     def run(self, name: str, check: Callable[[], str]) -> bool:
-        """One check. Whatever goes wrong in it is its failure."""
+        """Run one check. Any exception in it is its failure."""
         try:
             self.done.append(Check(name, True, check()))
         except (Failed, OSError, subprocess.SubprocessError, ValueError, LookupError) as error:
@@ -63,7 +63,7 @@ class Checks:
 
 
 def installed() -> str:
-    """The files are in place, and the units are sound."""
+    """The files are in place, and the units are valid."""
     version = call("/usr/bin/fusiond", "--version").strip()
     call("id", "fusiond")
     complaints = subprocess.run(
@@ -98,7 +98,7 @@ def make_interface(name: str) -> None:
 
 
 def start(unit: str) -> float:
-    """Start a unit; until it says that it is ready [s]. Raises Failed."""
+    """Start a unit; returns the time until it is ready [s]. Raises Failed."""
     began = time.monotonic()
     call("systemctl", "start", unit)
     seconds = time.monotonic() - began
@@ -128,14 +128,14 @@ def trace(folder: Path) -> str:
     rmse = statistics.fmean(error**2 for error in errors) ** 0.5
     if rmse > TRACE_RMSE_M:
         raise Failed(f"{rmse:.2f} m RMSE, most {max(errors):.1f} m")
-    same = replayed_alike(ETC / "rav4.toml", box, payloads)
+    same = replayed_identically(ETC / "rav4.toml", box, payloads)
     return (f"ready after {ready_s:.1f} s, {rmse:.2f} m RMSE, replay of the box: {same}; "
             f"player late by {vehicle.late_ns / 1e6:.0f} ms at most")
 
 
-def replayed_alike(file: Path, box: Path, payloads: list[bytes]) -> str:
-    """How many of the states that a replay of the black box publishes are, byte for byte, those received live. Those
-    that Zenoh dropped on their way are told. Raises Failed."""
+def replayed_identically(file: Path, box: Path, payloads: list[bytes]) -> str:
+    """The number of states of a replay of the black box that are, byte for byte, those received live, and of those that
+    Zenoh dropped. Raises Failed."""
     from fusiond.app.replay.replay import Replay, ReplayTask  # noqa: PLC0415
     from fusiond.config import load as config  # noqa: PLC0415 - installed by the check before
     from fusiond.messages.codec import encode  # noqa: PLC0415
@@ -159,7 +159,7 @@ def replayed_alike(file: Path, box: Path, payloads: list[bytes]) -> str:
 
 
 def journal_fields(unit: str) -> str:
-    """What the service says is structured."""
+    """The service's log is structured."""
     lines = call("journalctl", "--unit", unit, "--output", "json", "--no-pager", "--boot").splitlines()
     entries: list[dict[str, Any]] = [json.loads(line) for line in lines]
     for name in ("FUSIOND_SOURCE", "FUSIOND_MODE", "CODE_FUNC", "MESSAGE_ID"):
@@ -169,7 +169,7 @@ def journal_fields(unit: str) -> str:
 
 
 def removed() -> str:
-    """The package goes without a trace, but for configuration and recordings."""
+    """Removing the package leaves only configuration and recordings."""
     call("dpkg", "--remove", "fusiond")
     left = [path for path in ("/opt/fusiond", "/usr/bin/fusiond", "/usr/share/fusiond") if Path(path).exists()]
     left += call("systemctl", "list-unit-files", "--no-legend", "fusiond*", check=False).split()
@@ -189,7 +189,7 @@ def prepare(folder: Path) -> None:
 
 
 def tried(fault: Callable[[Bench], str], bench: Bench) -> str:
-    """Try a fault; once more if that failed while the machine itself stood still, by what the vehicle was late."""
+    """Try a fault; once more if it failed while the machine itself stopped, by the delay of the vehicle."""
     bench.vehicle.late_ns = 0
     try:
         return fault(bench)
@@ -201,7 +201,7 @@ def tried(fault: Callable[[Bench], str], bench: Bench) -> str:
 
 
 def keep_box(folder: Path) -> None:
-    """The black box and its configuration, to replay what went wrong."""
+    """Keep the black box and its configuration, to replay a failure."""
     with contextlib.suppress(OSError):  # a box that is away, or turns over, must not end the checks
         for file in (ETC / "fusiond.toml", ETC / "wheels.dbc", *sorted(BOX.iterdir())):
             folder.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Every fault that the service is to survive, a function each; what it returns is what was measured."""
+"""Every fault that the service must survive: one function each, which returns its figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def kill(bench: Bench) -> str:
 
 
 def hang(bench: Bench) -> str:
-    """SIGSTOP: the watchdog sees it."""
+    """SIGSTOP: the watchdog detects it."""
     pid, restarts, fused = bench.pid, bench.restarts, bench.fused()
     os.kill(pid, signal.SIGSTOP)
     noticed_s = wait("the watchdog ends it", lambda: is_gone(pid))
@@ -50,7 +50,7 @@ def interface_down(bench: Bench) -> str:
 
 
 def interface_deleted(bench: Bench) -> str:
-    """The CAN interface is deleted, and made anew."""
+    """The CAN interface is deleted, and created again."""
     began, restarts = time.monotonic_ns(), bench.restarts
     call("ip", "link", "delete", INTERFACE)
     wait("the wheels are missed", lambda: bench.fused_hz() < WITHOUT_WHEELS_HZ)
@@ -65,18 +65,18 @@ def _wheels_back(bench: Bench, began_ns: int, restarts: int) -> str:
 
 
 def autopilot_reboot(bench: Bench) -> str:
-    """The autopilot is silent for three seconds, and its boot time begins anew. In a bend that costs the heading, which has
-    to be found again."""
+    """The autopilot is silent for three seconds, and its boot time starts again. In a bend that costs the heading, which
+    must be found again."""
     began, restarts, requests = time.monotonic_ns(), bench.restarts, bench.vehicle.requests
     bench.vehicle.reboot()
-    wait("the messages are asked for again", lambda: bench.vehicle.requests >= requests + 3)
+    wait("the messages are requested again", lambda: bench.vehicle.requests >= requests + 3)
     seconds = (time.monotonic_ns() - began) / SECOND
     wait("the state has settled", lambda: time.monotonic_ns() > began + round(SETTLED_S * SECOND))
     return f"asked again after {seconds:.1f} s; {bench.steady(began, restarts, WITHOUT_IMU_M)}"
 
 
 def clock_step(bench: Bench) -> str:
-    """The wall clock is set an hour on, and back."""
+    """The wall clock is set forward by an hour, and back."""
     began, restarts = time.monotonic_ns(), bench.restarts
     for hours in (1, -1):
         stepped = time.clock_gettime_ns(time.CLOCK_REALTIME) + hours * 3600 * SECOND
@@ -91,7 +91,7 @@ def clock_step(bench: Bench) -> str:
 
 
 def disk_full(bench: Bench) -> str:
-    """The state folder's disk is full, and later is not."""
+    """The state folder's disk is full, and later has room again."""
     began, restarts = time.monotonic_ns(), bench.restarts
     filler = BOX.parent / "filler"
     with filler.open("wb", buffering=0) as file:
@@ -100,7 +100,7 @@ def disk_full(bench: Bench) -> str:
                 file.write(bytes(1 << 16))
         except OSError:
             filled = time.monotonic()
-    wait("the journal tells of it", lambda: "No space left" in bench.journal(filled), 30.0, 1.0)
+    wait("the journal reports it", lambda: "No space left" in bench.journal(filled), 30.0, 1.0)
     filler.unlink()
     names = set(BOX.iterdir())
 
@@ -112,7 +112,7 @@ def disk_full(bench: Bench) -> str:
 
 
 def many_times_the_load(bench: Bench) -> str:
-    """Ten times of everything for ten seconds."""
+    """Ten times the load for ten seconds."""
     usual = _sent_in(bench, 2.0) / 2.0
     began, restarts = time.monotonic_ns(), bench.restarts
     bench.vehicle.load = MANY
@@ -126,14 +126,14 @@ def many_times_the_load(bench: Bench) -> str:
 
 
 def _sent_in(bench: Bench, seconds: float) -> int:
-    """How many frames the vehicle sends in a time."""
+    """The number of frames that the vehicle sends in a time."""
     before, until = bench.vehicle.sent, time.monotonic() + seconds
     wait(f"{seconds:g} s pass", lambda: time.monotonic() > until)
     return bench.vehicle.sent - before
 
 
 def garbage(bench: Bench) -> str:
-    """Nonsense on every input for eight seconds: random bytes, flipped bits, wheels of random speeds, error frames."""
+    """Garbage on every input for eight seconds: random bytes, flipped bits, wheels of random speeds, error frames."""
     began, restarts = time.monotonic_ns(), bench.restarts
     bench.vehicle.noise = True
     try:
@@ -147,7 +147,7 @@ def reload(bench: Bench) -> str:
     """`systemctl reload`."""
     began, restarts, pid = time.monotonic_ns(), bench.restarts, bench.pid
     call("systemctl", "reload", bench.unit)
-    wait("the reload is told", lambda: "reloaded: " in bench.journal(began / SECOND), look_s=0.5)
+    wait("the reload is logged", lambda: "reloaded: " in bench.journal(began / SECOND), look_s=0.5)
     if bench.pid != pid:
         raise Failed("it was restarted")
     return bench.steady(began, restarts)

@@ -43,11 +43,11 @@ KillMode=process
 
 
 class Unavailable(Exception):
-    """No guest can be had on this machine; the message says why."""
+    """No guest can run on this machine; the message says why."""
 
 
 def build(cache: Path) -> None:
-    """Make, once, the guest's kernel and disk in a folder. Raises Unavailable."""
+    """Create the guest's kernel and disk in a folder, once. Raises Unavailable."""
     if (cache / "root.img").is_file():
         return
     if sys.version_info[:2] != PYTHON:
@@ -76,7 +76,7 @@ def build(cache: Path) -> None:
 
 
 def _tools(folder: Path) -> Path:
-    """The packages of what builds and boots the guest, unpacked."""
+    """The packages that build and boot the guest, unpacked."""
     if (folder / "done").is_file():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -148,8 +148,8 @@ def _call(command: Sequence[str], folder: Path | None = None) -> None:
 
 
 def run(cache: Path, job: Path, limit_s: float) -> int:
-    """Boot the guest, have it run `job/run`, show what that says as it says it. Returns its status; 124 after the time
-    limit, 125 where the guest died. Raises Unavailable."""
+    """Boot the guest, run `job/run` in it, and show its output as it comes. Returns its status; 124 after the time limit,
+    125 if the guest died. Raises Unavailable."""
     out = job / "out"
     out.mkdir(exist_ok=True)
     log = out / "log"
@@ -174,16 +174,16 @@ def run(cache: Path, job: Path, limit_s: float) -> int:
         if os.geteuid() == 0 and group.exists():
             group.write_text("-10")
         ends = time.monotonic() + limit_s
-        with log.open() as said:
+        with log.open() as output:
             while guest.poll() is None and time.monotonic() < ends:
-                sys.stdout.write(said.read())
+                sys.stdout.write(output.read())
                 sys.stdout.flush()
                 time.sleep(0.2)
             timed_out = guest.poll() is None
             if timed_out:
                 os.killpg(guest.pid, 9)
             guest.wait()
-            sys.stdout.write(said.read())
+            sys.stdout.write(output.read())
     if timed_out:
         return 124
     status = out / "status"

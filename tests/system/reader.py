@@ -1,4 +1,4 @@
-"""The reader of the system tests: subscribes to a vehicle's state over Zenoh, and holds it against the truth."""
+"""The reader of the system tests: subscribes to a vehicle's state over Zenoh, and compares it with the truth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ METRES_PER_DEGREE = 111_320.0
 
 
 class Arrival(NamedTuple):
-    """A state as it came."""
+    """A state as received."""
 
     t_ns: int  # monotonic
     payload: bytes
@@ -32,7 +32,7 @@ class Arrival(NamedTuple):
 
 
 class Reader:
-    """What has come so far, of any length of time."""
+    """All states received so far."""
 
     def __init__(self) -> None:
         self.arrivals: list[Arrival] = []
@@ -40,20 +40,20 @@ class Reader:
         self._came = Condition()
 
     def receive(self, sample: zenoh.Sample) -> None:
-        """From Zenoh's thread."""
+        """Called in Zenoh's thread."""
         arrival = Arrival(time.monotonic_ns(), sample.payload.to_bytes())
         with self._came:
             self.arrivals.append(arrival)
             self._came.notify_all()
 
     def since(self, t_ns: int, until_ns: int | None = None) -> list[Arrival]:
-        """What came from one instant to another."""
+        """The states received between two instants."""
         begin = bisect_left(self.arrivals, t_ns, key=lambda arrival: arrival.t_ns)
         end = None if until_ns is None else bisect_left(self.arrivals, until_ns, key=lambda arrival: arrival.t_ns)
         return self.arrivals[begin:end]
 
     def first(self, t_ns: int, wanted: Callable[[dict[str, Any]], bool], timeout_s: float) -> Arrival | None:
-        """The first state after an instant that is as wanted; None where none comes in time."""
+        """The first state after an instant that fulfils a condition; None if none comes in time."""
         at = len(self.arrivals) - len(self.since(t_ns))
         ends = time.monotonic() + timeout_s
         while True:
@@ -95,7 +95,7 @@ def reading(name: str, endpoint: str) -> Iterator[Reader]:
 
 
 class Truth:
-    """Where the vehicle was, of a truth.csv."""
+    """The positions of the vehicle, from a truth.csv."""
 
     def __init__(self, path: Path) -> None:
         with path.open(encoding="ascii", newline="") as file:
@@ -104,7 +104,7 @@ class Truth:
         self._places = [(float(row["lat_deg"]), float(row["lon_deg"])) for row in rows]
 
     def error_m(self, t_ns: int, message: dict[str, Any]) -> float | None:
-        """How far a state, at an instant of the recording, lies from the truth, horizontally; None without either."""
+        """Horizontal distance of a state from the truth at an instant of the recording; None without either."""
         at = bisect_left(self._t_ns, t_ns)
         state = message["state"]
         if state is None or at == 0 or at == len(self._t_ns):

@@ -1,5 +1,5 @@
 """The vehicle of the system tests: plays a recorded drive onto a CAN interface and as an autopilot over UDP, and can be
-made to reboot, to send many times as much, and to talk nonsense. It costs little: where there is one processor, it is the
+made to reboot, to send many times as much, and to send garbage. It costs little: where there is one processor, it is the
 service's as well."""
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ SECOND = 1_000_000_000  # ns
 FRAME = struct.Struct("=IB3x8s")  # linux/can.h: id and flags, length, data
 EXTENDED, ERROR = 1 << 31, 1 << 29  # flags
 IN_TIME_NS = 20_000_000  # a vehicle that is farther behind sends no copies
-BOOT_S = 3.0  # a rebooting autopilot says nothing for so long
+BOOT_S = 3.0  # a rebooting autopilot sends nothing for this long
 RETRY_NS = SECOND // 10  # between two attempts to open a CAN interface that is away
-LISTEN_NS = SECOND // 20  # between two looks at what fusiond said
+LISTEN_NS = SECOND // 20  # between two reads of fusiond's messages
 HEADER_2, IMU = 10, b"\x69\0\0"  # MAVLink 2: size of a frame's header, id of HIGHRES_IMU
 IMU_EXTRA = bytes([common.MAVLink_highres_imu_message.crc_extra])
 STAMP = struct.Struct("<Q")  # time_usec: HIGHRES_IMU's first field
@@ -32,15 +32,15 @@ NOISE_HZ = 200  # of each kind
 
 
 class Vehicle(Thread):
-    """One drive, from its first record to its last, at true speed. `load` sends everything so many times, the stamps of
-    the copies spread over the interval before, as far as it can in time; `noise` sends garbage besides."""
+    """One drive, from its first record to its last, in real time. `load` is how many times everything is sent, the copies
+    spread over the interval before, as fast as possible; `noise` sends garbage as well."""
 
     def __init__(self, folder: Path, tlog: str, canlog: str, channel: str, port: int, counted_id: int | None = None) -> None:
         super().__init__(name="vehicle", daemon=True)
         self.load, self.noise = 1, False
-        self.late_ns = 0  # how far it was behind at the most: this machine is too slow
+        self.late_ns = 0  # its largest delay: the machine is too slow
         self.sent = 0  # frames
-        self.requests = 0  # SET_MESSAGE_INTERVAL heard
+        self.requests = 0  # SET_MESSAGE_INTERVAL received
         self._tlog, self._canlog = folder / tlog, folder / canlog
         self._channel, self._counted_id = channel, counted_id
         self._bus: socket.socket | None = None
@@ -60,7 +60,7 @@ class Vehicle(Thread):
         self._unix_shift_us = 0
 
     def reboot(self) -> None:
-        """Fall silent for a while, then count the time from the boot anew."""
+        """Send nothing for a while, then count the time from a new boot."""
         self._silent_until_ns = time.monotonic_ns() + round(BOOT_S * SECOND)
         self._boot_us = self._time_us
 
@@ -90,7 +90,7 @@ class Vehicle(Thread):
                 self._send_mavlink(item, now)
             if self.noise and now >= next_noise_ns:
                 next_noise_ns = now + SECOND // NOISE_HZ
-                self._talk_nonsense(item if kind == "mavlink" else None, now)
+                self._send_garbage(item if kind == "mavlink" else None, now)
         if self._bus is not None:
             self._bus.close()
         self._socket.close()
@@ -143,7 +143,7 @@ class Vehicle(Thread):
         return message if message.get_type() in ("HEARTBEAT", "SYSTEM_TIME", "GPS_RAW_INT") else None
 
     def _listen(self) -> None:
-        """Count what fusiond asks for."""
+        """Count the requests of fusiond."""
         try:
             while True:
                 for message in self._ear.parse_buffer(self._socket.recv(65536)) or []:
@@ -156,7 +156,7 @@ class Vehicle(Thread):
         try:
             self._socket.send(data)
         except (BlockingIOError, ConnectionRefusedError):
-            return  # nobody listens just now
+            return  # no one listens at the moment
 
     def _send_can(self, number: int, is_extended: bool, data: bytes, now: int) -> None:
         if number == self._counted_id:  # once: copies of a wheel's frame are as stale as they look
@@ -181,7 +181,7 @@ class Vehicle(Thread):
                 self._bus.close()
                 self._bus = None
 
-    def _talk_nonsense(self, frame: bytes | None, now: int) -> None:
+    def _send_garbage(self, frame: bytes | None, now: int) -> None:
         noise = self._random
         self._write(noise.randbytes(noise.randrange(1, 300)))
         if frame is not None:

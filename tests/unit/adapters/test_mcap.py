@@ -193,10 +193,10 @@ def test_the_same_messages_give_the_same_bytes(replayed: tuple[Read, list[str], 
     assert (tmp_path / "b.mcap").read_bytes() == replayed[2].read_bytes()
 
 
-def write(path: Path, told: tuple[Message, ...]) -> list[Record]:
+def write(path: Path, published: tuple[Message, ...]) -> list[Record]:
     """All of the messages into a file, as `replay --mcap` does; the records that went in."""
     converter = Converter()
-    records = [record for message in told for record in converter.records(message)]
+    records = [record for message in published for record in converter.records(message)]
     with McapFile(path, settings()) as file:
         for record in records:
             file.add(record)
@@ -210,7 +210,7 @@ def test_the_configuration_is_in_the_file(replayed: tuple[Read, list[str], Path]
     assert json.loads(metadata.metadata["config"])["vehicle"]["name"] == "tested"
 
 
-def test_where_it_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs = [str(folder() / log) for log in LOGS]
     command = ["replay", "--config", str(folder() / "fusiond.toml"), *logs, "--mcap"]
     assert main([*command, str(tmp_path)]) == UNUSABLE
@@ -225,8 +225,8 @@ def test_where_it_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_file_cut_anywhere_is_repaired_up_to_there(tmp_path: Path) -> None:
-    told = messages()[:1000]
-    records = write(tmp_path / "whole.mcap", told)
+    published = messages()[:1000]
+    records = write(tmp_path / "whole.mcap", published)
     data = (tmp_path / "whole.mcap").read_bytes()
     expected = [(record.topic, record.log_ns, record.publish_ns, json.loads(record.data)) for record in records]
     cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
@@ -240,7 +240,7 @@ def test_a_file_cut_anywhere_is_repaired_up_to_there(tmp_path: Path) -> None:
     assert most == len(expected)
 
 
-def test_flipped_bytes_do_no_more_than_end_the_repair(tmp_path: Path) -> None:
+def test_flipped_bytes_only_end_the_repair(tmp_path: Path) -> None:
     records = write(tmp_path / "whole.mcap", messages()[:1500])
     data = bytearray((tmp_path / "whole.mcap").read_bytes())
     data[len(data) // 2] ^= 0x55
@@ -337,11 +337,11 @@ def test_files_follow_one_another_within_their_limit(tmp_path: Path) -> None:
 
 def test_a_crash_costs_the_last_second(tmp_path: Path) -> None:
     """The file as it lies on disk while the recorder is at work."""
-    told = messages()[:2500]
-    last = next(message for message in reversed(told) if isinstance(message, StateMessage))
+    published = messages()[:2500]
+    last = next(message for message in reversed(published) if isinstance(message, StateMessage))
     with McapFile(tmp_path / "open.mcap", settings()) as file:
         converter = Converter()
-        for message in told:
+        for message in published:
             for record in converter.records(message):
                 file.add(record)
         (tmp_path / "cut.mcap").write_bytes((tmp_path / "open.mcap").read_bytes())
@@ -352,11 +352,11 @@ def test_a_crash_costs_the_last_second(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_counted_and_survived(tmp_path: Path) -> None:
     output = recorder(tmp_path)
-    told = messages()
+    published = messages()
     converter = Converter()
-    total = len([record for message in told for record in converter.records(message)])
+    total = len([record for message in published for record in converter.records(message)])
     with limited_files(60_000), recording(output) as lost:
-        for message in told[:3000]:
+        for message in published[:3000]:
             output.outbox.put(message)
     assert "File too large" in str(lost[0]) and "fusion.mcap" in str(lost[0])
     (first,) = files_of(tmp_path)
@@ -364,7 +364,7 @@ def test_a_full_disk_is_counted_and_survived(tmp_path: Path) -> None:
     count, _ = repair(first, tmp_path / "mended.mcap")
     assert count == output.counts()["records"] > 0
     with recording(output) as lost:
-        for message in told[3000:]:
+        for message in published[3000:]:
             output.outbox.put(message)
     assert not lost and len(files_of(tmp_path)) == 2
     counts = output.counts()
@@ -382,7 +382,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_no_litter(tmp_path: Path) -> 
     assert files_of(tmp_path) == [] and output.counts()["records"] == 0
 
 
-def test_states_are_thinned_but_not_what_happens(tmp_path: Path) -> None:
+def test_states_are_thinned_but_not_events(tmp_path: Path) -> None:
     output = recorder(tmp_path, rate_hz=5.0)
     with recording(output):
         for message in messages():
@@ -400,7 +400,7 @@ def test_states_are_thinned_but_not_what_happens(tmp_path: Path) -> None:
     assert len(of(found, "events")) == sum(isinstance(m, EventMessage) for m in messages())
 
 
-def test_a_daemon_told_to_stop_closes_its_file(tmp_path: Path) -> None:
+def test_a_daemon_that_is_stopped_closes_its_file(tmp_path: Path) -> None:
     port = free_port()
     more = '[mcap]\nfolder = "out"\n'
     config = configuration(tmp_path, f"udpin:127.0.0.1:{port}", more)

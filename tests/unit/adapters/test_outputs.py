@@ -1,4 +1,4 @@
-"""Outputs under the daemon's roof: outboxes, supervision, isolation, and what is published besides the state."""
+"""Outputs of a daemon: supervision, isolation, and what is published besides the state."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Collector:
 
 
 class Stalled(Collector):
-    """An output whose consumer never comes to an end with its first message."""
+    """An output whose consumer never finishes its first message."""
 
     def __init__(self) -> None:
         super().__init__("stalled", size=16)
@@ -101,7 +101,7 @@ class Stalled(Collector):
 def driven(
     folder: Path, channel: str, outputs: list[Collector], more: str = "", *, zenoh: bool = False
 ) -> Iterator[tuple[Running, Callable[[Callable[[], bool]], None]]]:
-    """A daemon with outputs, and a function that plays autopilot and wheels until something holds."""
+    """A daemon with outputs, and a function that plays autopilot and wheels until a condition holds."""
     port = free_port()
     settings = configuration(folder, f"udpin:127.0.0.1:{port}", more, channel)
     autopilot = Autopilot()
@@ -116,7 +116,7 @@ def driven(
 # --- Supervision
 
 
-def test_a_stalled_and_a_failing_output_hold_up_nobody(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
+def test_a_stalled_and_a_failing_output_delay_nothing_else(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
     good, stalled = Collector(), Stalled()
     faulty = Collector("faulty", [OutputLost("no consumer"), ZeroDivisionError("a driver's"), OutputLost("again")])
     with driven(tmp_path, channel, [good, stalled, faulty]) as (run, drive_until):
@@ -150,7 +150,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, Path, li
     return run.daemon.config, folder / "box", collector.got, run
 
 
-def told(messages: list[Message], kind: type[Message]) -> list[Message]:
+def of_kind(messages: list[Message], kind: type[Message]) -> list[Message]:
     return [message for message in messages if type(message) is kind]
 
 
@@ -176,25 +176,25 @@ def test_the_health_accounts_for_everything(recorded: tuple[Config, Path, list[M
     total = [sum(getattr(source.outcomes, name) for source in health.sources.values()) for name in ("fused", "rejected")]
     assert total == [health.outcomes.fused, health.outcomes.rejected]
     seconds = {message.t_ns // 10**9 for message in healths}
-    assert len(healths) <= len(seconds) + 1 + len(told(messages, EventMessage))
+    assert len(healths) <= len(seconds) + 1 + len(of_kind(messages, EventMessage))
 
 
-def test_events_tell_of_modes_and_sources_once(recorded: tuple[Config, Path, list[Message], Running]) -> None:
+def test_events_report_modes_and_sources_once(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     events = [(message.kind, message.subject) for message in recorded[2] if isinstance(message, EventMessage)]
     assert [subject for kind, subject in events if kind == "mode"] == ["aligning", "nominal"]
     found = [subject for kind, subject in events if kind == "source_found"]
     assert sorted(found) == ["gps0.position", "gps0.velocity", "imu0", "left", "right"]
 
 
-def test_every_measurement_is_told_of(recorded: tuple[Config, Path, list[Message], Running]) -> None:
+def test_every_measurement_has_an_innovation(recorded: tuple[Config, Path, list[Message], Running]) -> None:
     _, _, messages, run = recorded
     innovations = [message for message in messages if isinstance(message, InnovationMessage)]
     wheels = [message for message in innovations if message.source == "left"]
     assert len(wheels) == len({message.t_receive_ns for message in wheels})
     outcomes = run.daemon.live.engine.fusion.outcomes()["left"]
-    assert sum(outcomes.values()) - len(wheels) <= outcomes["WAITING"] + 2  # those after the last tick
+    assert sum(outcomes.values()) - len(wheels) <= outcomes["WAITING"] + 2  # received after the last tick
     judged = [message for message in wheels if message.test_ratio is not None]
-    assert len(judged) > 20  # the others served to align
+    assert len(judged) > 20  # the others were used for alignment
     for message in judged:
         (innovation,), (variance,) = message.innovation, message.variance
         assert variance > 0 and message.test_ratio is not None
@@ -203,7 +203,7 @@ def test_every_measurement_is_told_of(recorded: tuple[Config, Path, list[Message
 
 
 def test_no_covariance_is_torn(recorded: tuple[Config, Path, list[Message], Running]) -> None:
-    """Whatever was published, as it lies here long after: symmetric, positive, and that of its own sigmas."""
+    """Every published covariance is symmetric, positive, and agrees with the sigmas, long after it was published."""
     states = [message for message in recorded[2] if isinstance(message, StateAtInstant) and message.state is not None]
     assert {type(message) for message in states} == {StateMessage, SettledMessage}
     for message in states:
@@ -232,19 +232,19 @@ def test_the_settled_state_lags_by_the_horizon(recorded: tuple[Config, Path, lis
     assert all(settings.filter.horizon_s <= lag < settings.filter.horizon_s + 0.5 for lag in lags)
 
 
-def test_a_replay_of_the_black_box_tells_the_same(recorded: tuple[Config, Path, list[Message], Running]) -> None:
-    """State, settled state, innovations and events are the same bytes; the health but for what the shell tells."""
+def test_a_replay_of_the_black_box_publishes_the_same(recorded: tuple[Config, Path, list[Message], Running]) -> None:
+    """State, settled state, innovations and events are the same bytes; the health except inputs, outputs, latencies."""
     settings, box, live, _ = recorded
     again: list[Message] = []
     Replay(settings, ReplayTask(settings.publish.rate_hz, on_message=[again.append])).run(
         open_logs([str(file) for file in sorted(box.iterdir())], settings)
     )
     for kind in (StateMessage, SettledMessage, InnovationMessage, EventMessage):
-        expected, found = told(live, kind), told(again, kind)
+        expected, found = of_kind(live, kind), of_kind(again, kind)
         assert len(found) > 1
         assert [encode(message, "json") for message in expected[: len(found)]] == [encode(m, "json") for m in found]
     shell = {"latency_ms", "inputs", "outputs"}
-    for one, other in zip(told(live, HealthMessage), told(again, HealthMessage), strict=False):
+    for one, other in zip(of_kind(live, HealthMessage), of_kind(again, HealthMessage), strict=False):
         left, right = json.loads(encode(one, "json")), json.loads(encode(other, "json"))
         assert {name: value for name, value in left.items() if name not in shell} == {
             name: value for name, value in right.items() if name not in shell
@@ -256,13 +256,13 @@ def test_info_and_config_say_what_runs(recorded: tuple[Config, Path, list[Messag
     info = next(message for message in messages if isinstance(message, InfoMessage))
     assert info.sources["left"] == "wheel_speed" and info.sources["imu0"] == "imu"
     assert info.keys["innovations"] == "fusiond/test/innovations/*"
-    told_config = next(message for message in messages if isinstance(message, ConfigMessage))
-    assert told_config.config == info.config
-    assert told_config.config["filter"]["heading_deg"] == settings.filter.heading_deg == 30.0
-    assert "directory" not in told_config.config
+    published_config = next(message for message in messages if isinstance(message, ConfigMessage))
+    assert published_config.config == info.config
+    assert published_config.config["filter"]["heading_deg"] == settings.filter.heading_deg == 30.0
+    assert "directory" not in published_config.config
 
 
-def test_a_reload_is_told(tmp_path: Path) -> None:
+def test_a_reload_is_published(tmp_path: Path) -> None:
     settings, collector = configuration(tmp_path, f"udpin:127.0.0.1:{free_port()}"), Collector()
     file = tmp_path / "live.toml"
     with running(settings, lambda: config.load(file), outputs=[collector]) as run:
@@ -270,15 +270,15 @@ def test_a_reload_is_told(tmp_path: Path) -> None:
         file.write_text(file.read_text().replace("reopen_max_s = 0.2", "reopen_max_s = 0.3"))
         run.call(run.daemon.reload)
         run.until(lambda: len(collector.of(ConfigMessage)) == 2)
-    told = [message.config["live"]["reopen_max_s"] for message in collector.got if isinstance(message, ConfigMessage)]
-    assert told == [0.2, 0.3]
+    periods = [message.config["live"]["reopen_max_s"] for message in collector.got if isinstance(message, ConfigMessage)]
+    assert periods == [0.2, 0.3]
 
 
 # --- Zenoh
 
 
 def test_a_router_that_dies_and_comes_back(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
-    """The estimator goes on as if nothing were; the reader gets the latest health again after the router is back."""
+    """The estimator continues undisturbed; the reader gets the latest health again after the router is back."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     section = Zenoh(mode="router", listen=[endpoint])
     collector, heard = Collector(), []
@@ -318,8 +318,8 @@ def test_a_router_away_at_first(tmp_path: Path, channel: str, bus: can.BusABC) -
                 assert client.alive() == {"test"}
 
 
-def test_a_stalled_subscriber_holds_up_nobody(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
-    """It takes one sample and hangs, in its callback; another reader of the same daemon gets what comes meanwhile."""
+def test_a_stalled_subscriber_delays_nothing_else(tmp_path: Path, channel: str, bus: can.BusABC) -> None:
+    """It hangs in its callback after one sample; another reader of the same daemon gets all that comes meanwhile."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     stuck, release, heard = Event(), Event(), []
 

@@ -1,4 +1,4 @@
-"""Prometheus: what a scrape over HTTP tells, parsed by the makers' own parser."""
+"""Prometheus: a scrape over HTTP, parsed by the makers' own parser."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def value(samples: Samples, name: str, **labels: str) -> float:
     return samples[f"fusiond_{name}", frozenset(labels.items())]
 
 
-def scrape_after(told: list[Any]) -> Samples:
-    """What is scraped once all of these were taken in."""
+def scrape_after(published: list[Any]) -> Samples:
+    """A scrape after these messages."""
     server = server_of()
     with serving(server):
-        for message in told:
+        for message in published:
             server.outbox.put(message)
-        last = [message for message in told if isinstance(message, StateMessage)][-1]
+        last = [message for message in published if isinstance(message, StateMessage)][-1]
         for _ in range(1000):
             samples = scrape(server)
             if samples.get(("fusiond_time_seconds", frozenset())) == last.t_ns / SECOND:
@@ -64,13 +64,13 @@ def scrape_after(told: list[Any]) -> Samples:
     raise AssertionError("the messages were not taken in")
 
 
-def test_a_scrape_tells_of_state_sources_and_innovations() -> None:
+def test_a_scrape_has_state_sources_and_innovations() -> None:
     everything = list(messages())
     health = [message for message in everything if isinstance(message, HealthMessage)][-1]
-    told = everything[: everything.index(health)]
-    state = next(message for message in reversed(told) if isinstance(message, StateMessage))
-    innovations = [message for message in told if isinstance(message, InnovationMessage)]
-    samples = scrape_after([*[m for m in told if m is not state], health, state])
+    published = everything[: everything.index(health)]
+    state = next(message for message in reversed(published) if isinstance(message, StateMessage))
+    innovations = [message for message in published if isinstance(message, InnovationMessage)]
+    samples = scrape_after([*[m for m in published if m is not state], health, state])
     assert state.state is not None and value(samples, "info", version=health.version, vehicle="tested") == 1
     assert value(samples, "mode", mode="dead_reckoning") == 1 and value(samples, "mode", mode="nominal") == 0
     assert value(samples, "position_sigma_meters", axis="d") == state.state.sigma_position_ned_m[2]
@@ -93,8 +93,8 @@ def test_latencies_and_losses() -> None:
     quantiles = Quantiles(p50=1.0, p90=2.0, p99=3.0, max=4.0)
     inputs = {"can.car": InputHealth(received=100, dropped=7, counts={})}
     outputs = {"zenoh": OutputHealth(offered=50, dropped=3, latency_ms=quantiles, counts={}, notes={})}
-    told = msgspec.structs.replace(health, latency_ms=LatencyHealth(fused=quantiles), inputs=inputs, outputs=outputs)
-    samples = scrape_after([told, next(message for message in messages() if isinstance(message, StateMessage))])
+    published = msgspec.structs.replace(health, latency_ms=LatencyHealth(fused=quantiles), inputs=inputs, outputs=outputs)
+    samples = scrape_after([published, next(message for message in messages() if isinstance(message, StateMessage))])
     assert value(samples, "latency_seconds", stage="fused", quantile="0.99") == 0.003
     assert value(samples, "latency_seconds", stage="output zenoh", quantile="1") == 0.004
     assert value(samples, "input_frames_total", input="can.car") == 100
@@ -113,7 +113,7 @@ def test_before_the_first_message_and_after_the_end() -> None:
     assert server.url is None and server.counts() == {"scrapes": 1}
 
 
-def test_a_taken_port_is_told() -> None:
+def test_a_port_in_use_is_reported() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

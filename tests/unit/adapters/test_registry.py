@@ -36,7 +36,7 @@ def test_every_log_format_has_a_reader(reader: str) -> None:
     assert callable(import_module(f"fusiond_adapters.{reader}").open_log)
 
 
-def test_suffixes_are_unlike() -> None:
+def test_suffixes_are_unique() -> None:
     assert len({kind.suffix for kind in LOG_FORMATS}) == len(LOG_FORMATS)
 
 
@@ -44,7 +44,7 @@ def test_inputs_are_named_by_section(tmp_path: Path) -> None:
     assert list(make_inputs(configuration(tmp_path, "udpin:127.0.0.1:14550"), CONTEXT)) == ["mavlink.fc", "can.car"]
 
 
-def test_a_configuration_gets_the_outputs_that_it_asks_for(tmp_path: Path) -> None:
+def test_a_configuration_gets_the_outputs_that_it_turns_on(tmp_path: Path) -> None:
     plain = configuration(tmp_path, "udpin:127.0.0.1:14550")
     assert list(make_outputs(plain, OutputContext(CONTEXT.clock, make_inputs(plain, CONTEXT)))) == ["zenoh"]
     more = '[autopilot]\nlink = "fc"\n[ground_station]\nconnection = "udpout:127.0.0.1:14551"\n'
@@ -53,13 +53,13 @@ def test_a_configuration_gets_the_outputs_that_it_asks_for(tmp_path: Path) -> No
     assert list(made) == ["zenoh", "autopilot", "ground_station"]
 
 
-def test_an_unknown_log_is_told_which_are_known(tmp_path: Path) -> None:
+def test_an_unknown_log_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     (tmp_path / "a.db.gz").write_bytes(b"x")
     with pytest.raises(LogError) as refused:
         open_logs([tmp_path / "a.db.gz"], config.parse('[mavlink.fc]\n[imu.imu0]\nlink = "fc"\n[gnss.g]\nlink = "fc"\n'))
-    told = str(refused.value)
-    assert all(f"{kind.suffix} ({kind.about})" in told for kind in LOG_FORMATS)
-    assert told.endswith("all but .db and .mf4 also with .gz")
+    text = str(refused.value)
+    assert all(f"{kind.suffix} ({kind.about})" in text for kind in LOG_FORMATS)
+    assert text.endswith("all but .db and .mf4 also with .gz")
 
 
 def test_nothing_is_imported_for_what_is_off() -> None:

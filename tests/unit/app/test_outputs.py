@@ -1,4 +1,4 @@
-"""The fan-out: what each output gets, who waits for whom, failures, and an end that loses nothing."""
+"""The fan-out: what each output gets, waiting, failures, and an end that loses nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HELLO = ConfigMessage(vehicle="v", config={})
 
 
 class Slow:
-    """An output that takes its time, and may first fail."""
+    """An output that is slow, and may fail at first."""
 
     def __init__(self, name: str, size: int, pause_s: float = 0.0, fault: Exception | None = None) -> None:
         self.name = self.about = name
@@ -72,7 +72,7 @@ def test_patience_loses_nothing_however_slow_the_output() -> None:
     assert outputs.unsent() == {"slow": 0, "quick": 0}
 
 
-def test_without_patience_nobody_waits() -> None:
+def test_without_patience_nothing_waits() -> None:
     stalled, quick = Slow("stalled", 8), Slow("quick", 5000)
     with running(stalled, quick) as outputs:
         stalled.may_take.clear()
@@ -87,7 +87,7 @@ def test_without_patience_nobody_waits() -> None:
 
 
 def test_patience_has_an_end_and_comes_back() -> None:
-    """It waits once for an output that takes nothing; what is lost then is counted; it waits again once that takes some."""
+    """It waits once for an output that takes nothing; later losses are counted; it waits again once messages are taken."""
     stalled = Slow("stalled", 4)
     with running(stalled, patience_s=0.3) as outputs:
         stalled.may_take.clear()
@@ -109,7 +109,7 @@ def test_patience_has_an_end_and_comes_back() -> None:
     assert stalled.got[-500:] == list(map(event, range(500)))
 
 
-def test_what_cannot_be_opened_is_told_and_tried_again() -> None:
+def test_what_cannot_be_opened_is_reported_and_tried_again() -> None:
     faulty = Slow("faulty", 4, fault=OutputLost("no consumer"))
     with running(faulty) as outputs:
         assert outputs.failures == {"faulty": "no consumer"}
@@ -122,7 +122,7 @@ def test_what_cannot_be_opened_is_told_and_tried_again() -> None:
     assert faulty.got == [event(1), HELLO]
 
 
-def test_what_is_left_with_an_output_that_is_away_at_the_end_is_counted() -> None:
+def test_messages_left_with_a_closed_output_are_counted() -> None:
     faulty = Slow("faulty", 10, fault=OutputLost("no consumer"))
     with running(faulty) as outputs:
         for number in range(3):
@@ -130,7 +130,7 @@ def test_what_is_left_with_an_output_that_is_away_at_the_end_is_counted() -> Non
     assert outputs.unsent() == {"faulty": 3}
 
 
-def test_all_is_introduced_again_when_asked() -> None:
+def test_the_introduction_is_sent_again_on_request() -> None:
     one = Slow("one", 10)
     with running(one) as outputs:
         outputs.introduce()
@@ -149,7 +149,7 @@ def test_stopped_before_it_began_it_ends_at_once() -> None:
 
 @pytest.mark.parametrize("patience_s", [0.0, 5.0])
 def test_a_reader_may_put_into_its_own_full_box(patience_s: float) -> None:
-    """Its own thread is the only one that could make room: waiting would be in vain."""
+    """Only its own thread could make room: waiting would be useless."""
     box = Outbox(1, (Message,))
     box.patience_s = patience_s
     box.put(event(1))

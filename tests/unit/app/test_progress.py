@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from fusiond.app.progress import line, shown
-
-SECOND = 1_000_000_000  # ns
+from fusiond.units import SECOND
 
 
 class Terminal:

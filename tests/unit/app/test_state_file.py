@@ -1,4 +1,4 @@
-"""The state on disk: whole or not at all, ignored when it is of no use; and the daemon that keeps it and starts by it."""
+"""The state file: replaced atomically, ignored if unusable; and the daemon that writes it and starts from it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def bus(tmp_path: Path) -> Iterator[can.BusABC]:
 
 
 def settings(folder: Path, port: int, bus: can.BusABC, more: str = "") -> Config:
-    """A vehicle at rest that has a state file, and is told its heading."""
+    """A vehicle at rest with a state file and a configured heading."""
     channel = str(bus.channel_info).rpartition(" ")[2]
     return configuration(folder, f"udpin:127.0.0.1:{port}", KEEP + more, channel)
 
@@ -60,7 +60,7 @@ def without_heading(folder: Path) -> Config:
 
 
 def stand(run: Running, port: int, bus: can.BusABC, until: Callable[[], bool]) -> None:
-    """Play a vehicle at rest until something holds."""
+    """Play a vehicle at rest until a condition holds."""
     peer, send = udp(port)
     with closing(peer):
         drive(run, send, bus, until, Autopilot())
@@ -71,23 +71,23 @@ def last(run: Running) -> Mode | None:
 
 
 def note(run: Running) -> str:
-    """What the health says of the stored state."""
+    """The note on the stored state in the health."""
     return run.daemon.health.outputs["state"].notes["hot_start"] if run.daemon.health else ""
 
 
 def leave_a_state(folder: Path, bus: can.BusABC) -> StoredState:
-    """What is on disk while a first run, that knew its heading, goes on: what a kill leaves."""
+    """The file on disk during a first run with a configured heading, as a kill would leave it."""
     port, file = free_port(), folder / "state.json"
     with running(settings(folder, port, bus)) as run:
         stand(run, port, bus, lambda: file.exists() and b'"at_rest": true' in file.read_bytes())
         killed = file.read_bytes()
-    assert from_text(file.read_bytes()).t_ns >= from_text(killed).t_ns  # once more at the orderly end
+    assert from_text(file.read_bytes()).t_ns >= from_text(killed).t_ns  # written again at the orderly end
     file.write_bytes(killed)
     return from_text(killed)
 
 
 def test_killed_and_started_again(tmp_path: Path, bus: can.BusABC) -> None:
-    """It knows its heading at once, though nobody tells it; and the recording replays to the same bytes."""
+    """The stored heading is used at once; and the recording replays to the same bytes."""
     leave_a_state(tmp_path, bus)
     port = free_port()
     settings(tmp_path, port, bus, '[record]\nfolder = "box"\n')
@@ -132,7 +132,7 @@ def test_a_torn_file_is_a_cold_start(tmp_path: Path, bus: can.BusABC, caplog: py
         assert last(run) is Mode.ALIGNING
         assert "ignored: torn or altered" in note(run)
     assert sum("stored state ignored" in record.message for record in caplog.records) == 1
-    assert file.read_bytes() == torn  # there was nothing better to keep
+    assert file.read_bytes() == torn  # there was no better state
 
 
 def fused(run: Running) -> int:
@@ -189,7 +189,7 @@ def test_it_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (DAY, {"gnss": {"delay_ms": 50.0}}, "the sensors are configured otherwise than they were"),
     ],
 )
-def test_what_is_of_no_use_is_ignored(
+def test_an_unusable_file_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, age_ns: int, tables: dict[str, dict[str, object]], reason: str
 ) -> None:
     path = tmp_path / "state.json"
@@ -202,13 +202,13 @@ def test_what_is_of_no_use_is_ignored(
 
 
 @pytest.mark.parametrize("content", [b"", b"null", b"[]", b"{}", b'{"version": 9}', b"\xff\xfe", b"x" * 2_000_000])
-def test_nonsense_is_ignored(tmp_path: Path, content: bytes) -> None:
+def test_garbage_is_ignored(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "state.json"
     path.write_bytes(content)
     assert StateFile(path, streams.config(), NOW).stored is None
 
 
-def test_a_folder_in_its_place_is_told(tmp_path: Path) -> None:
+def test_a_folder_in_its_place_is_reported(tmp_path: Path) -> None:
     file = StateFile(tmp_path, streams.config(), NOW)
     assert file.health(Verdict.NONE).notes["hot_start"] == "ignored: cannot be read: Is a directory"
     file.write(left(NOW, streams.config()))

@@ -1,4 +1,4 @@
-"""What is kept open: pauses that grow, one line for each reason, faults that go no further."""
+"""Keeping an input or output open: growing pauses, one line for each reason, faults that are not passed on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Part:
 
 
 class Pauses(Event):
-    """An event that notes how long it was waited for, and never waits."""
+    """An event that records the waits and never waits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -29,7 +29,7 @@ class Pauses(Event):
 
 
 def kept(over: Event, *ends: Exception | None) -> list[str]:
-    """Sessions that end so, one after the other; the reasons told. None: asked to end."""
+    """Sessions with these ends, one after the other; returns the reasons reported. None: it was asked to end."""
     left, reasons = list(ends), []
 
     def session() -> None:
@@ -44,7 +44,7 @@ def kept(over: Event, *ends: Exception | None) -> list[str]:
     return reasons
 
 
-def test_pauses_grow_up_to_their_limit_and_begin_anew_after_a_session_that_was_asked_to_end() -> None:
+def test_pauses_grow_up_to_their_limit_and_start_again_after_a_session_that_was_asked_to_end() -> None:
     over = Pauses()
     lost = [InputLost("away")] * 4
     assert kept(over, *lost, None, OutputLost("gone"), None) == ["away"] * 4 + ["gone"]
@@ -59,7 +59,7 @@ def test_each_change_of_the_reason_is_logged_once(caplog: pytest.LogCaptureFixtu
     ]
 
 
-def test_a_fault_is_logged_whole_and_goes_no_further(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_fault_is_logged_with_its_traceback_and_not_passed_on(caplog: pytest.LogCaptureFixture) -> None:
     assert kept(Pauses(), ZeroDivisionError("a driver's"), None) == ["failed: ZeroDivisionError(\"a driver's\")"]
     assert caplog.records[0].exc_info is not None
 

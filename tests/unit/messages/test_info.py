@@ -9,17 +9,17 @@ from tests.helpers.streams import config
 
 def test_information_names_keys_and_kinds_of_sources() -> None:
     settings = config(["left"])
-    told = info_message(settings, Fusion(settings))
+    info = info_message(settings, Fusion(settings))
     name = settings.vehicle.name
-    assert told.keys["state"] == f"fusiond/{name}/state"
-    assert told.keys["innovations"] == f"fusiond/{name}/innovations/*"
-    assert told.sources == {
+    assert info.keys["state"] == f"fusiond/{name}/state"
+    assert info.keys["innovations"] == f"fusiond/{name}/innovations/*"
+    assert info.sources == {
         "imu0": "imu", "gps0.position": "gnss_position", "gps0.velocity": "gnss_velocity", "left": "wheel_speed"
     }  # fmt: skip
 
 
 def test_the_configuration_is_plain_values_with_defaults_and_without_its_folder() -> None:
-    told = config_message(config(["left"])).config
-    assert told["wheel"]["left"]["bus"] == "bus"
-    assert told["filter"]["horizon_s"] > 0
-    assert "directory" not in told
+    table = config_message(config(["left"])).config
+    assert table["wheel"]["left"]["bus"] == "bus"
+    assert table["filter"]["horizon_s"] > 0
+    assert "directory" not in table

@@ -1,4 +1,4 @@
-"""Innovations: each measurement once, as it was judged at the tick; what asking costs; what has none."""
+"""Innovations: each measurement once, with its outcome at the tick; their cost; what has none."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from fusiond.messages import InnovationMessage, Message
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers.drive import LOGS, folder, settings
 
-SECOND = 1_000_000_000  # ns
-
 
 @pytest.fixture(scope="module")
 def events() -> list[Received]:
@@ -33,8 +31,8 @@ def run(setup: Config, events: Iterable[Received], rate_hz: float = 50.0) -> tup
     return engine, [message for message in sent if isinstance(message, InnovationMessage)]
 
 
-def test_they_cost_no_rewind(events: list[Received], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fixes of this drive come late, position and velocity at once: one rewind serves both."""
+def test_they_cause_no_rewind(events: list[Received], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fixes of this drive are late, position and velocity together: one rewind is enough for both."""
     rewinds, rewind = 0, History._rewind
 
     def counted(history: History, first_changed: int) -> None:
@@ -44,8 +42,8 @@ def test_they_cost_no_rewind(events: list[Received], monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(History, "_rewind", counted)
     found = []
-    for told in (False, True):
-        setup = replace(settings(), publish=replace(settings().publish, innovations=told))
+    for enabled in (False, True):
+        setup = replace(settings(), publish=replace(settings().publish, innovations=enabled))
         rewinds = 0
         engine, _ = run(setup, events)
         found.append((rewinds, engine.fusion.history.rerun))
@@ -64,16 +62,16 @@ def test_every_measurement_has_one_and_outcomes_add_up(events: list[Received]) -
 
 
 @pytest.mark.parametrize("rate_hz", [0.2, 1.0])
-def test_rare_ticks_lose_no_judgement(events: list[Received], rate_hz: float) -> None:
-    """The history forgets after a second; between two ticks here there is one, and there are five."""
+def test_rare_ticks_lose_no_outcome(events: list[Received], rate_hz: float) -> None:
+    """The history drops rows after a second; here a second or five lie between two ticks."""
     _, often = run(settings(), events)
     _, rarely = run(settings(), events, rate_hz)
     last_ns = max(message.t_receive_ns for message in rarely)
     judged = {(message.source, message.t_ns) for message in often if message.test_ratio is not None}
-    told = {(message.source, message.t_ns) for message in rarely if message.test_ratio is not None}
+    published = {(message.source, message.t_ns) for message in rarely if message.test_ratio is not None}
     expected = {(m.source, m.t_ns) for m in often if m.t_receive_ns <= last_ns} & judged
     assert len(expected) > 500
-    assert expected <= told  # and some that a late fix gave a state to be judged by
+    assert expected <= published  # and some that had no state before a late fix
     assert {message.outcome for message in rarely} <= {"fused", "rejected"}
 
 
@@ -89,9 +87,9 @@ def test_an_unusable_inertial_sample_has_none(events: list[Received], payload: I
     assert {message.source for message in innovations} == set(settings().sources()) - {"imu0"}
 
 
-def test_an_unusable_fix_is_told_with_its_reason(events: list[Received]) -> None:
+def test_an_unusable_fix_is_published_with_its_reason(events: list[Received]) -> None:
     at = next(n for n, event in enumerate(events) if event.source == "gps0.position")
     bad = replace(events[at], sequence=10**6, payload=Invalid("no fix"))
     _, innovations = run(settings(), [*events[:at], bad, *events[at:]])
-    (told,) = (message for message in innovations if message.outcome == "invalid")
-    assert (told.source, told.reason, told.test_ratio, told.innovation) == ("gps0.position", "no fix", None, ())
+    (message,) = (message for message in innovations if message.outcome == "invalid")
+    assert (message.source, message.reason, message.test_ratio, message.innovation) == ("gps0.position", "no fix", None, ())

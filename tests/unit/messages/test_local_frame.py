@@ -1,4 +1,4 @@
-"""States in local frames, against matrices put together independently; the odometry frame under corrections."""
+"""States in local frames against independent matrices; the odometry frame under corrections."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_a_state_far_from_the_origin(
     assert_allclose(square(there), world @ square(s.covariance_position_m2) @ world.T, atol=1e-14)
 
 
-def test_what_ros_people_expect() -> None:
+def test_conventions_of_ros() -> None:
     """At the origin, heading east, 10 m/s, turning right: along x, yaw 0, turning about -z."""
     east = tuple(quaternion(matrix_from_euler(0.0, 0.0, math.pi / 2)).tolist())
     s = random_state(quaternion_nb=east, velocity_ned_mps=(0.0, 10.0, 0.0), angular_rate_b_rps=(0.0, 0.0, 0.5))
@@ -83,14 +83,14 @@ STEP_NS, SPEED, TURN = 20_000_000, 10.0, 0.3  # ns, m/s, rad/s
 
 
 def driven(number: int, shift: float = 0.0, turned: float = 0.0) -> tuple[int, LocalState]:
-    """A circle, told with an error of position [m] and of heading [rad]."""
+    """A circle, with an error of position [m] and of heading [rad]."""
     heading = TURN * number * STEP_NS / 1e9
     radius = SPEED / TURN
-    told = heading + turned
+    estimated = heading + turned
     none = (0.0,) * 9
     x, y = radius * math.sin(heading) + shift, radius * (1 - math.cos(heading))
-    velocity = (SPEED * math.cos(told), SPEED * math.sin(told), 0.0)
-    half = (math.cos(told / 2), 0.0, 0.0, math.sin(told / 2))
+    velocity = (SPEED * math.cos(estimated), SPEED * math.sin(estimated), 0.0)
+    half = (math.cos(estimated / 2), 0.0, 0.0, math.sin(estimated / 2))
     rate = (0.0, 0.0, TURN)
     return number * STEP_NS, LocalState((x, y, 0.0), half, velocity, (SPEED, 0.0, 0.0), rate, rate, none, none, none)  # type: ignore[arg-type]
 
@@ -131,7 +131,7 @@ def test_a_reset_moves_the_odometry_frame_and_not_the_body_in_it() -> None:
         assert abs(heading(odom)) == pytest.approx(0.4 if jumped else 0.0, abs=1e-9)
 
 
-def test_over_a_pause_the_odometry_frame_rests() -> None:
+def test_in_a_gap_the_odometry_frame_does_not_move() -> None:
     frame = OdometryFrame()
     for number in range(10):
         odom, _ = frame.follow(*driven(number, shift=5.0 if number >= 5 else 0.0))

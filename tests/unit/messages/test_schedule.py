@@ -1,4 +1,4 @@
-"""What is published at ticks besides the state: resets with their reasons, holes, the health when something changes."""
+"""The messages of ticks besides the state: resets with their reasons, gaps, the health when something changes."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.helpers.live import configuration
 
 
 class Player:
-    """An engine, played by hand."""
+    """An engine and a simple drive."""
 
     def __init__(self, settings: Config) -> None:
-        self.told: list[Message] = []
-        self._engine = Engine(settings, self.told.append, rate_hz=10.0)
+        self.published: list[Message] = []
+        self._engine = Engine(settings, self.published.append, rate_hz=10.0)
 
     def play(self, seconds: float, begin_s: float = 0.0, metres_off: Callable[[float], float] = lambda _: 0.0) -> None:
-        """A vehicle at rest, whose receiver is off to the north by so many metres at a second."""
+        """A vehicle at rest; its receiver has an error to the north [m] by the second."""
         for number in range(round(seconds * 50)):
             second, wobble = begin_s + number / 50, 0.01 * (number % 7 - 3)
             self._feed("imu0", second, ImuSample((wobble, 0.0, -9.81), (1e-4, wobble / 10, 0.0)))
@@ -40,12 +40,12 @@ class Player:
 
 
 def test_a_reset_is_published_with_its_reason(tmp_path: Path) -> None:
-    """A receiver that stays 300 m away is taken as right in the end; before that its measurements are rejected."""
+    """A receiver with a constant error of 300 m is rejected, until the state is set to it."""
     settings = configuration(tmp_path, "udpin:127.0.0.1:1")
     settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, gnss_reset_s=10.0))
     player = Player(settings)
     player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
-    messages = player.told
+    messages = player.published
     why = "gps0.position: rejected with a constant error for too long; the state was set to it"
     events = [message for message in messages if isinstance(message, EventMessage)]
     assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
@@ -62,12 +62,12 @@ def test_a_reset_is_published_with_its_reason(tmp_path: Path) -> None:
     assert jump.t_ns == next(message.t_ns for message in events if message.kind == "reset")  # at once
 
 
-def test_a_hole_in_the_data_is_published(tmp_path: Path) -> None:
+def test_a_gap_in_the_data_is_published(tmp_path: Path) -> None:
     settings = configuration(tmp_path, "udpin:127.0.0.1:1")
     settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, restart_gap_s=3.0))
     player = Player(settings)
     player.play(2.0)
     player.play(2.0, begin_s=7.0)
-    texts = [message.text for message in player.told if isinstance(message, EventMessage)]
+    texts = [message.text for message in player.published if isinstance(message, EventMessage)]
     assert "state reset: no data for more than 3 s; aligning again" in texts
     assert "imu0: nothing received for 2 s" in texts

@@ -1,4 +1,4 @@
-"""The inbox of an input: what it keeps when its estimator cannot keep up."""
+"""The inbox of an input: which frames it keeps if the estimator is too slow."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def test_an_empty_one_wakes_once_and_gives_all_in_order() -> None:
     assert inbox.take() == []
 
 
-def test_a_full_one_thins_what_comes_often_and_keeps_what_comes_seldom() -> None:
+def test_a_full_one_thins_frequent_kinds_and_keeps_rare_ones() -> None:
     """A hundred inertial samples for every fix, four times as many as there is room for: every fix is kept, no second
-    is without samples, and nothing is lost without being counted."""
+    is without samples, and every loss is counted."""
     inbox: Inbox[str] = Inbox(256, lambda: None, hash)
     for number in range(1024):
         inbox.put(number, "fix" if number % 100 == 0 else "sample")
@@ -32,8 +32,8 @@ def test_a_full_one_thins_what_comes_often_and_keeps_what_comes_seldom() -> None
     assert samples[-1] == 1023
 
 
-def test_thinning_does_not_make_a_rolling_counter_stand_still() -> None:
-    """Of a wheel's frames with a counter of three bits, hardly any look as stale as the one before."""
+def test_thinning_does_not_make_a_rolling_counter_look_stale() -> None:
+    """Of a wheel's frames with a counter of three bits, hardly any look like a repeat of the previous one."""
     inbox: Inbox[int] = Inbox(512, lambda: None, lambda _: "wheel")
     for number in range(4096):
         inbox.put(number, number % 8)
@@ -41,7 +41,7 @@ def test_thinning_does_not_make_a_rolling_counter_stand_still() -> None:
     assert sum(sooner == later for sooner, later in pairwise(counters)) < 0.2 * len(counters)
 
 
-def test_kinds_without_number_drop_the_oldest() -> None:
+def test_if_there_are_too_many_kinds_the_oldest_are_dropped() -> None:
     inbox: Inbox[int] = Inbox(18, lambda: None, hash)
     for number in range(19):
         inbox.put(number, number)

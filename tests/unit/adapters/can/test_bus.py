@@ -19,7 +19,7 @@ def can_frame(number: int, data: bytes, flags: int = 0, size: int = 16) -> bytes
     return struct.pack("=IBBxx", number, len(data), flags) + data.ljust(size - 8, b"\0")
 
 
-def test_error_frames_are_counted_and_a_change_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_error_frames_are_counted_and_a_change_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "fusiond")
     bus = CanBus(configuration(tmp_path, "udpin:127.0.0.1:14550"), "car", Inbox(16, lambda: None, hash), HostClock())
 
@@ -27,7 +27,7 @@ def test_error_frames_are_counted_and_a_change_is_told(tmp_path: Path, caplog: p
         assert bus.decode(CanFrame(classes, False, bytes([0, detail, *bytes(6)]), is_error=True), 0) == []
         return bus.state
 
-    told = [
+    states = [
         error(0x04, 0x08),
         error(0x04, 0x20),
         error(0x04, 0x20),
@@ -36,7 +36,7 @@ def test_error_frames_are_counted_and_a_change_is_told(tmp_path: Path, caplog: p
         error(0x100),
         error(0x04, 0x01),
     ]
-    assert told == ["error-warning", "error-passive", "error-passive", "error-passive", "bus-off", "active", "active"]
+    assert states == ["error-warning", "error-passive", "error-passive", "error-passive", "bus-off", "active", "active"]
     lines = [record.getMessage().rpartition(" ")[2] for record in caplog.records]
     assert lines == ["error-warning", "error-passive", "bus-off", "active"]
     expected = {"error frames": 7, "error passive": 2, "error warning": 1, "bus off": 1, "restarted": 1}

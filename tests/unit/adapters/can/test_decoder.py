@@ -126,7 +126,7 @@ def test_a_short_frame_loses_only_what_it_lacks(folder: Path) -> None:
     assert payloads(reader.decode(256, False, axle(LEFT=36.0) + bytes(8), 0))[0] == WheelSpeed(10.0)
 
 
-def test_ids_of_both_lengths_are_told_apart(folder: Path) -> None:
+def test_ids_of_both_lengths_are_distinguished(folder: Path) -> None:
     reader = decoder(folder, wheel(), wheel("exact", "EXACT", "SPEED", 'unit = "m/s"'))
     assert reader.decode(256, True, axle(LEFT=36.0), 0) == []
     assert reader.decode(0x18FEBFFE, False, bytes(8), 0) == []
@@ -252,7 +252,7 @@ def test_j1939_by_the_key_or_by_the_dbc(folder: Path) -> None:
     assert parameter_group(0x18EF1234) == 0xEF00  # with a destination, which is no part of it
 
 
-def test_a_unit_that_contradicts_the_dbc_is_told(folder: Path) -> None:
+def test_a_unit_that_contradicts_the_dbc_is_reported(folder: Path) -> None:
     assert decoder(folder, wheel()).warnings == []
     (warning,) = decoder(folder, wheel(more='unit = "mph"')).warnings
     assert warning == "wheel.left.unit: is mph, but the DBC says that LEFT is in km/h"

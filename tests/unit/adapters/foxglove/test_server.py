@@ -52,12 +52,12 @@ def test_a_client_gets_the_states_and_events() -> None:
         assert not lost and server.notes() == {"url": server.url}
         with client.connect(server.url, subprotocols=["foxglove.sdk.v1"], open_timeout=DEADLINE) as peer:
             assert json.loads(peer.recv(DEADLINE))["name"] == "fusiond tested"
-            told = {one["topic"]: one for one in json.loads(peer.recv(DEADLINE))["channels"]}
+            channels_sent = {one["topic"]: one for one in json.loads(peer.recv(DEADLINE))["channels"]}
             assert {(c.topic, c.schema_name, c.schema.decode()) for c in channels(settings())} == {
-                (one["topic"], one["schemaName"], one["schema"]) for one in told.values()
+                (one["topic"], one["schemaName"], one["schema"]) for one in channels_sent.values()
             }
             wanted = {7: TOPICS[StateMessage], 8: POSE, 9: LOG}
-            subscriptions = [{"id": number, "channelId": told[topic]["id"]} for number, topic in wanted.items()]
+            subscriptions = [{"id": number, "channelId": channels_sent[topic]["id"]} for number, topic in wanted.items()]
             peer.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
             got: dict[str, tuple[int, bytes]] = {}
             sent: dict[int, StateMessage] = {}
@@ -71,8 +71,8 @@ def test_a_client_gets_the_states_and_events() -> None:
                     kind, number, t_ns = struct.unpack_from("<BIQ", data)
                     assert kind == 1
                     got[wanted[number]] = t_ns, data[13:]
-    t_ns, told_state = got[TOPICS[StateMessage]]
-    assert told_state == encode(sent[t_ns], "json")
+    t_ns, published_state = got[TOPICS[StateMessage]]
+    assert published_state == encode(sent[t_ns], "json")
     assert json.loads(got[LOG][1])["message"] == event.text
     assert json.loads(got[POSE][1])["frame_id"] == "local_enu"
     assert server.url is None and server.counts()["records"] >= 5
@@ -89,7 +89,7 @@ def test_a_topic_that_it_does_not_have_is_counted() -> None:
     assert not lost and server.counts()["unknown topics"] == 1
 
 
-def test_a_taken_port_is_told_and_tried_again() -> None:
+def test_a_port_in_use_is_reported_and_tried_again() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -108,8 +108,8 @@ def test_a_client_that_does_not_read_holds_up_nothing() -> None:
         client.connect(server.url, subprotocols=["foxglove.sdk.v1"], max_queue=1, close_timeout=0.1) as peer,
     ):
         peer.recv(DEADLINE)
-        told = json.loads(peer.recv(DEADLINE))["channels"]
-        subscriptions = [{"id": number, "channelId": one["id"]} for number, one in enumerate(told)]
+        channels_sent = json.loads(peer.recv(DEADLINE))["channels"]
+        subscriptions = [{"id": number, "channelId": one["id"]} for number, one in enumerate(channels_sent)]
         peer.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
         for _ in range(rounds):  # 10 MB in all, of which the peer reads nothing
             for message in states():

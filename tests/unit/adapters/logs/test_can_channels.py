@@ -52,7 +52,7 @@ def test_the_only_channel_is_used_as_the_only_bus(tmp_path: Path) -> None:
         (configured("body", "can9"), ("can0",), "wheel frames are on can0, wanted on can9"),
     ],
 )
-def test_channels_of_nobody_are_said(
+def test_channels_of_no_bus_are_named(
     tmp_path: Path, settings: Config, channels: tuple[str, ...], complaint: str
 ) -> None:
     with pytest.raises(LogError, match=complaint):

@@ -81,10 +81,10 @@ def test_what_else_is_on_the_wires_changes_no_event(tmp_path: Path) -> None:
     assert sum(frame.arbitration_id >= 0x200 for frame in frames) == pytest.approx(10 * 1000.5, rel=0.01)
     assert [frame.timestamp for frame in frames] == sorted(frame.timestamp for frame in frames)
     link = mavutil.mavlink_connection(str(paths["drive.tlog"]), dialect="common")
-    told = [message for message in iter(link.recv_msg, None) if message.get_type() in TELEMETRY_HZ]
-    assert {message.get_type() for message in told} == set(TELEMETRY_HZ)
-    assert [m.groundspeed for m in told if m.get_type() == "VFR_HUD"][-1] == pytest.approx(12.0, abs=0.1)
-    assert [m.yaw for m in told if m.get_type() == "ATTITUDE"][-1] == pytest.approx(np.radians(30), abs=0.01)
+    messages = [message for message in iter(link.recv_msg, None) if message.get_type() in TELEMETRY_HZ]
+    assert {message.get_type() for message in messages} == set(TELEMETRY_HZ)
+    assert [m.groundspeed for m in messages if m.get_type() == "VFR_HUD"][-1] == pytest.approx(12.0, abs=0.1)
+    assert [m.yaw for m in messages if m.get_type() == "ATTITUDE"][-1] == pytest.approx(np.radians(30), abs=0.01)
     link.close()
 
 

@@ -70,7 +70,7 @@ def test_commands_change_what_is_sent(peer: UdpListener, tmp_path: Path) -> None
     stamps = iter(range(now() - 4000 * MS, now(), 40 * MS))
 
     def offered(count: int) -> int:
-        """How many of so many states were told of."""
+        """The number of states sent, of some number put into the outbox."""
         places, attitudes = (len(endpoint.of(name)) for name in (STREAMS[0], STREAMS[2]))
         for _ in range(count):
             station.outbox.put(state_at(next(stamps)))

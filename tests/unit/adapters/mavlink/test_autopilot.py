@@ -178,7 +178,7 @@ UNFIT: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "reason"), UNFIT)
-def test_an_unfit_state_is_not_sent_and_it_is_said_once(
+def test_an_unfit_state_is_not_sent_and_that_is_reported_once(
     udp: UdpPeer, tmp_path: Path, changes: dict[str, Any], reason: str
 ) -> None:
     settings, link = link_to(udp, tmp_path, ON + LIMITS)
@@ -228,7 +228,7 @@ def test_a_state_that_waited_too_long_is_not_sent(tmp_path: Path) -> None:
     assert not link.sent and output.counts()["stale"] == 1
 
 
-def test_a_closed_link_is_counted_and_told(tmp_path: Path) -> None:
+def test_a_closed_link_is_counted_and_reported(tmp_path: Path) -> None:
     output, link = made(tmp_path, ON)
     link.open = False
     output.offer(state_at(10**18))
@@ -327,7 +327,7 @@ def test_the_autopilot_is_asked_for_its_status_and_it_is_read_back(udp: UdpPeer,
 # --- A peer that does not read
 
 
-def test_a_stalled_peer_delays_nobody_and_tears_no_frame(tmp_path: Path) -> None:
+def test_a_stalled_peer_delays_nothing_else_and_tears_no_frame(tmp_path: Path) -> None:
     stalled = TcpPeer(buffer=4096)
     _, link = link_to(stalled, tmp_path, ON)
     endpoint = Endpoint(stalled)

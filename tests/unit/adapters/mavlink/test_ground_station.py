@@ -108,7 +108,7 @@ def check_local(m: Any, state: State, first: State) -> None:
     assert m.az == pytest.approx(force_n[2] + 9.8075, abs=2e-3)
 
 
-def test_estimator_status_tells_ratios_and_whether_there_is_a_position(peer: UdpListener, tmp_path: Path) -> None:
+def test_estimator_status_has_ratios_and_whether_there_is_a_position(peer: UdpListener, tmp_path: Path) -> None:
     station, _ = station_at(peer.connection, tmp_path)
     endpoint = from_station(peer)
     counts = OutcomeCounts()
@@ -149,7 +149,7 @@ def test_texts_survive_their_chunks(length: int) -> None:
     assert length <= 50 or [len(part) == 50 for part in read] == [True] * (len(read) - 1) + [False]
 
 
-def test_events_are_told(peer: UdpListener, tmp_path: Path) -> None:
+def test_events_are_sent_as_texts(peer: UdpListener, tmp_path: Path) -> None:
     station, _ = station_at(peer.connection, tmp_path)
     endpoint = from_station(peer)
     long = "gps0.position has been silent for 12.5 s; the last fix was rejected, and before that came 14 which were fused"
@@ -182,7 +182,7 @@ def test_heartbeats_stop_when_the_estimator_does(peer: UdpListener, tmp_path: Pa
     assert (mark.get_srcSystem(), mark.get_srcComponent(), mark.type) == (MARKER, 1, common.MAV_TYPE_GROUND_ROVER)
 
 
-def test_the_marker_alone_says_where_a_vehicle_is(peer: UdpListener, tmp_path: Path) -> None:
+def test_only_the_marker_has_the_position_of_a_vehicle(peer: UdpListener, tmp_path: Path) -> None:
     station, now = station_at(peer.connection, tmp_path, f"marker_system = {MARKER}\n")
     endpoint = from_station(peer)
     state = state_at(now(), 3)
@@ -271,9 +271,9 @@ def test_the_daemon_feeds_autopilot_and_ground_station(peer: UdpListener, tmp_pa
 
     with running(settings) as run:
         endpoint.until(turn)
-        told = [m for m in run.messages if m.state is not None]
+        published = [m for m in run.messages if m.state is not None]
         notes = run.daemon.outputs["autopilot"].notes()
-    by_time = {m.t_ns // 1000: m for m in told}
+    by_time = {m.t_ns // 1000: m for m in published}
     for m in endpoint.of("ODOMETRY")[:5]:
         state = by_time[m.time_usec].state
         assert state is not None and m.q == pytest.approx(state.quaternion_nb, abs=1e-6)

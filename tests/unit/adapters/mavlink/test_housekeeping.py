@@ -63,11 +63,11 @@ def test_nothing_is_wanted_of_a_link_without_sensors_or_requests() -> None:
     assert wanted("fc", TEXT.replace("[mavlink.fc]", "[mavlink.fc]\nrequest = false")) == {}
 
 
-def requests(said: list[bytes]) -> list[int]:
-    return sorted(int(m.param1) for m in parsed(b"".join(said)) if m.get_type() == "COMMAND_LONG")
+def requests(sent: list[bytes]) -> list[int]:
+    return sorted(int(m.param1) for m in parsed(b"".join(sent)) if m.get_type() == "COMMAND_LONG")
 
 
-def test_nothing_is_asked_of_a_ground_station(settings: Config) -> None:
+def test_nothing_is_requested_from_a_ground_station(settings: Config) -> None:
     housekeeping = Housekeeping(settings, "fc")
     station = common.MAVLink(None, srcSystem=255, srcComponent=190)
     message = common.MAVLink_heartbeat_message(common.MAV_TYPE_GCS, common.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)
@@ -76,26 +76,26 @@ def test_nothing_is_asked_of_a_ground_station(settings: Config) -> None:
     assert requests(housekeeping.due(SECOND, alive=True)) == []
 
 
-def test_nothing_is_asked_of_a_component_that_is_not_the_configured_one(settings: Config) -> None:
+def test_nothing_is_requested_from_another_component(settings: Config) -> None:
     link = msgspec.structs.replace(settings.mavlink["fc"], component=2)
     housekeeping = Housekeeping(msgspec.structs.replace(settings, mavlink={"fc": link}), "fc")
     housekeeping.receive(Autopilot().heartbeat(), 0)
     assert housekeeping.target is None
 
 
-def test_asks_again_ever_more_seldom_until_the_rate_is_met(settings: Config) -> None:
+def test_requests_are_repeated_at_growing_intervals_until_the_rate_is_reached(settings: Config) -> None:
     housekeeping, autopilot = Housekeeping(settings, "fc"), Autopilot()
     housekeeping.receive(autopilot.heartbeat(), 0)
     assert housekeeping.target == (SYSTEM, 1)
-    asked = [second for second in range(60) if 105 in requests(housekeeping.due(second * SECOND, alive=True))]
-    assert asked == [0, 3, 9, 21, 45]
+    sent_at = [second for second in range(60) if 105 in requests(housekeeping.due(second * SECOND, alive=True))]
+    assert sent_at == [0, 3, 9, 21, 45]
     for _ in range(250):  # of the 300 wanted in three seconds
         housekeeping.receive(autopilot.imu(), 62 * SECOND)
     assert 105 not in requests(housekeeping.due(63 * SECOND, alive=True))
     assert housekeeping.wanted["HIGHRES_IMU"].measured_hz == pytest.approx(250 / 3, rel=0.5)
 
 
-def test_a_rate_that_falls_is_asked_for_at_once(settings: Config) -> None:
+def test_a_rate_that_falls_is_requested_at_once(settings: Config) -> None:
     housekeeping, autopilot = Housekeeping(settings, "fc"), Autopilot()
     housekeeping.receive(autopilot.heartbeat(), 0)
     housekeeping.due(0, alive=True)
@@ -117,46 +117,46 @@ def test_a_refusal_is_remembered(settings: Config) -> None:
 
 def test_heartbeats_stop_with_the_estimator(settings: Config) -> None:
     housekeeping = Housekeeping(settings, "fc")
-    told = [len(housekeeping.due(second * SECOND // 2, alive=second < 10)) for second in range(20)]
-    assert told == [1, 0] * 5 + [0] * 10
+    counts = [len(housekeeping.due(second * SECOND // 2, alive=second < 10)) for second in range(20)]
+    assert counts == [1, 0] * 5 + [0] * 10
 
 
-def questions(said: list[bytes]) -> list[int]:
-    return [m.ts1 for m in parsed(b"".join(said)) if m.get_type() == "TIMESYNC" and m.tc1 == 0]
+def timesync_requests(sent: list[bytes]) -> list[int]:
+    return [m.ts1 for m in parsed(b"".join(sent)) if m.get_type() == "TIMESYNC" and m.tc1 == 0]
 
 
-def test_time_is_asked_for_fast_at_first_and_after_a_reboot(settings: Config) -> None:
+def test_timesync_is_frequent_at_first_and_after_a_reboot(settings: Config) -> None:
     housekeeping, autopilot = Housekeeping(settings, "fc"), Autopilot()
-    assert questions(housekeeping.due(0, alive=True)) == []  # whom?
+    assert timesync_requests(housekeeping.due(0, alive=True)) == []  # no autopilot yet
     housekeeping.receive(autopilot.heartbeat(), 0)
     step = SECOND // 20
-    asked = [k * step for k in range(200) if questions(housekeeping.due(k * step, alive=True))]
-    assert asked[:20] == [k * 2 * step for k in range(20)]
-    assert {b - a for a, b in pairwise(asked[20:])} == {SECOND}
-    (stamp,) = questions(housekeeping.due(11 * SECOND + 123_456, alive=True))
+    sent_at = [k * step for k in range(200) if timesync_requests(housekeeping.due(k * step, alive=True))]
+    assert sent_at[:20] == [k * 2 * step for k in range(20)]
+    assert {b - a for a, b in pairwise(sent_at[20:])} == {SECOND}
+    (stamp,) = timesync_requests(housekeeping.due(11 * SECOND + 123_456, alive=True))
     assert abs(stamp - (11 * SECOND + 123_456)) < 1000 and stamp % 1000 == 117
     for boot_ms in (10_000, 100):
         housekeeping.receive(autopilot.system_time(boot_ms), 12 * SECOND)
     for later_ns in (1, 3 * step):
-        assert questions(housekeeping.due(12 * SECOND + later_ns, alive=True))
+        assert timesync_requests(housekeeping.due(12 * SECOND + later_ns, alive=True))
 
 
-def test_what_changes_is_told_once(settings: Config) -> None:
+def test_changes_are_reported_once(settings: Config) -> None:
     housekeeping, autopilot = Housekeeping(settings, "fc"), Autopilot()
     housekeeping.receive(autopilot.heartbeat(), 0)
     for second in range(13):
         for _ in range(0 if second < 6 else 100):
             housekeeping.receive(autopilot.imu(), second * SECOND)
         housekeeping.due(second * SECOND, alive=True)
-    told = [line for line in housekeeping.changes if "IMU" in line or "autopilot" in line]
-    assert told == [
+    changes = [line for line in housekeeping.changes if "IMU" in line or "autopilot" in line]
+    assert changes == [
         f"the autopilot is system {SYSTEM}, component 1",
         "HIGHRES_IMU comes at 0 Hz, wanted at 100 Hz",
         "HIGHRES_IMU comes at 100 Hz, wanted at 100 Hz",
     ]
 
 
-def test_an_overtaken_frame_is_no_reboot(settings: Config) -> None:
+def test_a_reordered_frame_is_no_reboot(settings: Config) -> None:
     housekeeping, autopilot = Housekeeping(settings, "fc"), Autopilot()
     housekeeping.receive(autopilot.heartbeat(), 0)
     for boot_ms in (10_000, 9_500, 10_500):

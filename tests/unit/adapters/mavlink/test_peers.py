@@ -42,7 +42,7 @@ RATES = {105: 100.0, 24: 5.0, 124: 5.0, 9000: 10.0, 29: 10.0, 2: 1.0}  # what fu
 
 
 class Autopilot:
-    """Sends what it is asked for, at the rate it is asked for, until told to stop."""
+    """Sends the requested messages at the requested rates, until stopped."""
 
     def __init__(self, where: str, **options: Any) -> None:
         self.asked: dict[int, float] = {}  # message: rate [Hz]
@@ -147,13 +147,13 @@ def test_replay_of_the_recording_measures_the_same_round_trips(tmp_path: Path, m
     settings = configuration(tmp_path, f"udpin:127.0.0.1:{port}", MORE + '[record]\nfolder = "box"\n')
     with running(settings) as run, autopilot.flying():
         check(run, autopilot)
-    told: list[bytes] = []
-    task = ReplayTask(settings.publish.rate_hz, on_tick=[lambda message, _: told.append(encode(message, "json"))])
+    published: list[bytes] = []
+    task = ReplayTask(settings.publish.rate_hz, on_tick=[lambda message, _: published.append(encode(message, "json"))])
     replay = Replay(settings, task)
     replay.run(open_logs([str(path) for path in (tmp_path / "box").iterdir()], settings))
     assert replay.engine.fusion.clock.report() == run.daemon.live.engine.fusion.clock.report()
-    assert len(told) > 20
-    assert [encode(message, "json") for message in run.messages][: len(told)] == told
+    assert len(published) > 20
+    assert [encode(message, "json") for message in run.messages][: len(published)] == published
 
 
 def test_over_a_serial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

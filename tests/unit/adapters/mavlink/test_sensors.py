@@ -112,7 +112,7 @@ def test_what_a_counter_must_not_do(boot: float, left: float, right: float, reas
         assert good == [WheelSpeed(pytest.approx(5.0))] * 2
 
 
-def test_a_wheel_that_is_not_told_of_and_one_without_a_stamp() -> None:
+def test_a_wheel_that_is_not_in_the_message_and_one_without_a_stamp() -> None:
     vehicle = Vehicle(WHEELS)
     vehicle.wheels(1000, 5.0)
     assert payloads(vehicle.wheels(1100, 5.5)) == [WheelSpeed(pytest.approx(5.0)), Invalid("no such wheel")]

@@ -46,18 +46,18 @@ def heartbeat(sender: common.MAVLink) -> bytes:
     return bytes(common.MAVLink_heartbeat_message(10, 3, 0, 0, 0, 3).pack(sender))
 
 
-def test_what_is_said_satisfies_pymavlink(settings: Config) -> None:
-    said = b"".join(Housekeeping(settings, "fc").due(second * SECOND, alive=True)[0] for second in range(3))
+def test_sent_frames_satisfy_pymavlink(settings: Config) -> None:
+    sent = b"".join(Housekeeping(settings, "fc").due(second * SECOND, alive=True)[0] for second in range(3))
     reader = common.MAVLink(None)
     reader.signing.secret_key = KEY
-    assert [message.get_type() for message in reader.parse_buffer(said)] == ["HEARTBEAT"] * 3
+    assert [message.get_type() for message in reader.parse_buffer(sent)] == ["HEARTBEAT"] * 3
     stranger = common.MAVLink(None)
     stranger.signing.secret_key = bytes(32)
     stranger.robust_parsing = True
-    assert {message.get_type() for message in stranger.parse_buffer(said)} == {"BAD_DATA"}
+    assert {message.get_type() for message in stranger.parse_buffer(sent)} == {"BAD_DATA"}
 
 
-def test_what_is_heard_must_be_signed_newer_and_whole(settings: Config) -> None:
+def test_received_frames_must_be_signed_newer_and_whole(settings: Config) -> None:
     signing, sender = Signing(settings, "fc"), peer()
     first, second = heartbeat(sender), heartbeat(sender)
     assert signing.accepts(first)
@@ -84,16 +84,16 @@ def test_unsigned_frames_where_they_may_come(tmp_path: Path) -> None:
 
 def stamps(settings: Config, frames: int) -> list[int]:
     housekeeping = Housekeeping(settings, "fc")
-    said = [housekeeping.due(second * SECOND, alive=True)[0] for second in range(frames)]
-    return [int.from_bytes(frame[-12:-6], "little") for frame in said]
+    sent = [housekeeping.due(second * SECOND, alive=True)[0] for second in range(frames)]
+    return [int.from_bytes(frame[-12:-6], "little") for frame in sent]
 
 
 def test_timestamps_ascend_over_restarts_whatever_the_clock(settings: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = stamps(settings, 5)
+    found = stamps(settings, 5)
     for wall_s in (1_800_000_000, 1_700_000_000, 0):  # set back, and back
         monkeypatch.setattr("time.time_ns", lambda wall_s=wall_s: wall_s * 10**9)
-        told += stamps(settings, 5)
-    assert all(b > a for a, b in pairwise(told))
+        found += stamps(settings, 5)
+    assert all(b > a for a, b in pairwise(found))
     assert not settings.path("stamp.new").exists()
 
 

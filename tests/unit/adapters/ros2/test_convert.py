@@ -21,7 +21,7 @@ from tests.helpers.ros2 import (
     STORE,
     T0,
     health,
-    told,
+    state_numbered,
 )
 
 
@@ -33,27 +33,28 @@ def read(name: str, payload: bytes) -> Any:
     return STORE.deserialize_cdr(payload, KINDS[name])
 
 
-def test_nothing_is_told_of_a_state_that_is_not_fit() -> None:
+def test_nothing_is_sent_of_a_state_that_is_not_usable() -> None:
     converter = Converter(Ros2())
-    unfit = [told(1, Mode.ALIGNING, state=None), told(2, Mode.LOST), told(3, Mode.LOST, state=None)]
+    aligning, lost = state_numbered(1, Mode.ALIGNING, state=None), state_numbered(2, Mode.LOST)
+    unfit = [aligning, lost, state_numbered(3, Mode.LOST, state=None)]
     assert payloads(converter, *unfit) == {} and converter.unfit == 3
     assert converter.origin == "none yet"
-    assert set(payloads(converter, told(4, Mode.DEAD_RECKONING))) == {"odometry", "/tf", "twist", "fix"}
-    assert set(payloads(Converter(Ros2(tf=False)), told(5))) == {"odometry", "twist", "fix"}
+    assert set(payloads(converter, state_numbered(4, Mode.DEAD_RECKONING))) == {"odometry", "/tf", "twist", "fix"}
+    assert set(payloads(Converter(Ros2(tf=False)), state_numbered(5))) == {"odometry", "twist", "fix"}
 
 
 def test_a_fix_by_dead_reckoning_is_not_called_a_fix() -> None:
     for mode, status in ((Mode.NOMINAL, 0), (Mode.DEAD_RECKONING, -1)):
-        assert read("fix", payloads(Converter(Ros2()), told(1, mode))["fix"]).status.status == status
+        assert read("fix", payloads(Converter(Ros2()), state_numbered(1, mode))["fix"]).status.status == status
 
 
 def test_the_origin_stays_where_it_was_given_or_first_found() -> None:
-    first = told(1)
+    first = state_numbered(1)
     assert first.state is not None
     converter = Converter(Ros2())
     assert_allclose(numbers(read("odometry", payloads(converter, first)["odometry"]).pose.pose.position), 0.0, atol=1e-8)
     origin = converter.origin
-    again = read("odometry", payloads(converter, told(2, resets=1))["odometry"])
+    again = read("odometry", payloads(converter, state_numbered(2, resets=1))["odometry"])
     assert np.linalg.norm(numbers(again.pose.pose.position)) > 100 and converter.origin == origin
     place = (first.state.lat_deg, first.state.lon_deg, first.state.height_m - 2.0)
     given = read("odometry", payloads(Converter(Ros2(origin=place)), first)["odometry"])
@@ -65,13 +66,13 @@ def numbers(message: Any) -> list[float]:
 
 
 @pytest.mark.parametrize(("rate", "count"), [(50.0, 50), (20.0, 20), (1.0, 1), (1000.0, 50)])
-def test_states_are_told_at_a_rate_of_their_own(rate: float, count: int) -> None:
+def test_states_are_sent_at_a_rate_of_their_own(rate: float, count: int) -> None:
     converter = Converter(Ros2(rate_hz=rate, tf=False))
-    sent = [name for number in range(100) for name, _ in converter.state(told(number))]
+    sent = [name for number in range(100) for name, _ in converter.state(state_numbered(number))]
     assert len(sent) == pytest.approx(2 * count * 3, abs=3)
 
 
-def test_diagnostics_tell_of_a_reset_at_once() -> None:
+def test_diagnostics_report_a_reset_at_once() -> None:
     converter = Converter(Ros2())
 
     def diagnosed(message: HealthMessage) -> dict[str, Any]:
@@ -95,8 +96,8 @@ def test_diagnostics_tell_of_a_reset_at_once() -> None:
     assert diagnosed(health(T0 + 11 * SECOND, Mode.LOST, resets=3))["fusiond: state"].level == 2
 
 
-def test_angles_are_told_in_radians_and_stamps_in_whole_nanoseconds() -> None:
-    message = told(3)
+def test_angles_are_in_radians_and_stamps_in_whole_nanoseconds() -> None:
+    message = state_numbered(3)
     odometry = read("odometry", payloads(Converter(Ros2()), message)["odometry"])
     stamp = odometry.header.stamp
     assert (stamp.sec, stamp.nanosec) == divmod(message.t_ns, SECOND)

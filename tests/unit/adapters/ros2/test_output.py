@@ -28,7 +28,7 @@ from fusiond_adapters.ros2.convert import Converter
 from fusiond_adapters.ros2.output import Ros2Output, make, topics
 from fusiond_adapters.zenoh.session import open_session
 from tests.helpers.network import DEADLINE, free_port
-from tests.helpers.ros2 import T0, definitions, health, told
+from tests.helpers.ros2 import T0, definitions, health, state_numbered
 
 SUBSCRIBER = """
 import atexit, json, os, queue, sys
@@ -66,8 +66,8 @@ for _ in range(2 * len(asked)):
 for _ in range(2 * len(asked)):
     sample = raw.get(timeout=15)
     attachment = Attachment.from_bytes(sample.attachment.to_bytes())
-    told = [attachment.sequence_id, attachment.timestamp_ns, attachment.gid.hex(), sample.attachment.to_bytes().hex()]
-    print(json.dumps([str(sample.key_expr), *told, sample.payload.to_bytes().hex()]), flush=True)
+    found = [attachment.sequence_id, attachment.timestamp_ns, attachment.gid.hex(), sample.attachment.to_bytes().hex()]
+    print(json.dumps([str(sample.key_expr), *found, sample.payload.to_bytes().hex()]), flush=True)
 for topic, *_ in asked:
     seen = get_topic_info(topic, 42, router_port=port, verbose=True).publishers
     print(json.dumps([[p.node_name, p.node_namespace, p.topic_type, p.type_hash, p.qos] for p in seen]), flush=True)
@@ -136,7 +136,7 @@ def test_the_sdk_receives_every_number_in_another_process() -> None:
     for name, topic in topics(Ros2(namespace="/rover")):
         name_of[topic.name] = name
         asked.append([topic.name, topic.kind, topic.hash, *definitions(topic.kind)])
-    sent = [told(1), told(2)]
+    sent = [state_numbered(1), state_numbered(2)]
     states = [message.state for message in sent if message.state is not None]
     expected = Converter(Ros2(namespace="/rover"))
     diagnosed = [health(), health(T0 + SECOND, Mode.DEAD_RECKONING, resets=1)]
@@ -172,7 +172,7 @@ def wait_for_interest(running: Running) -> None:
 
         with publisher._publisher.declare_matching_listener(watch):
             status: Any = publisher._publisher.matching_status
-            assert status.matching or matched.wait(DEADLINE), "nobody subscribed"
+            assert status.matching or matched.wait(DEADLINE), "no subscriber"
 
 
 def check_numbers(decoded: dict[str, list[Any]], states: list[State], sent: list[StateMessage]) -> None:
@@ -274,7 +274,7 @@ def test_a_router_that_goes_and_comes_back() -> None:
         arrived = Event()
         with session.declare_subscriber("42/**", lambda sample: (heard.append(sample.payload), arrived.set())):
             wait_for_interest(again)
-            again.put(told(1))
+            again.put(state_numbered(1))
             assert arrived.wait(DEADLINE)
     assert again.output.counts()["sent"] == 4
 
@@ -283,6 +283,6 @@ def test_humble_has_no_hashes() -> None:
     assert {topic.hash for _, topic in topics(Ros2(type_hashes=False))} == {"TypeHashNotSupported"}
 
 
-def test_it_says_where_it_connects() -> None:
+def test_it_describes_where_it_connects() -> None:
     (output,) = make(Config(ros2=Ros2(enabled=True)), None)  # type: ignore[arg-type]
     assert output.name == "ros2" and "tcp/127.0.0.1:7447" in output.about

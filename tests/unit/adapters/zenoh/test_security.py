@@ -76,7 +76,7 @@ def event(text: str, vehicle: str = "rover") -> EventMessage:
     return EventMessage(vehicle=vehicle, t_ns=1, kind="mode", severity="info", subject="nominal", text=text)
 
 
-def test_a_reader_gets_what_its_vehicle_says(samples: Path, endpoint: str) -> None:
+def test_a_reader_gets_the_messages_of_its_vehicle(samples: Path, endpoint: str) -> None:
     with (
         vehicle(samples, endpoint) as publisher,
         Client(endpoint, "rover", config_file=samples / "reader.json5") as client,
@@ -90,8 +90,8 @@ def test_a_reader_gets_what_its_vehicle_says(samples: Path, endpoint: str) -> No
         assert next(heard).text == "after"
 
 
-def test_a_reader_cannot_speak_for_a_vehicle(samples: Path, endpoint: str) -> None:
-    """The vehicle's word comes; the forged one, which the router had before, does not."""
+def test_a_reader_cannot_publish_for_a_vehicle(samples: Path, endpoint: str) -> None:
+    """The vehicle's message arrives; the forged one, which the router received before, does not."""
     came = Event()
     heard: list[str] = []
 
@@ -109,7 +109,7 @@ def test_a_reader_cannot_speak_for_a_vehicle(samples: Path, endpoint: str) -> No
     ):
         forger.publish(event("forged"))
         foreign.publish(event("of another", "other"))
-        for liar in (forger, foreign):  # an answer tells that the router has had what was sent before
+        for liar in (forger, foreign):  # an answer shows that the router has processed everything before
             assert list(liar._session.get("fusiond/x/info", timeout=1.0)) == []
         rover.publish(event("true"))
         assert came.wait(DEADLINE)
@@ -127,14 +127,14 @@ def test_a_vehicle_cannot_read(samples: Path, endpoint: str) -> None:
             spy.latest(EventMessage)
 
 
-def test_nobody_gets_in_without_a_certificate(samples: Path, endpoint: str) -> None:
+def test_no_access_without_a_certificate(samples: Path, endpoint: str) -> None:
     bare = samples / "bare.json5"
     bare.write_text('{transport: {link: {tls: {root_ca_certificate: "%s"}}}}' % (samples / "ca.pem"))
     with pytest.raises(ClientError, match="Unable to connect"):
         Client(endpoint, "rover", config_file=bare)
 
 
-def test_a_router_of_another_authority_is_not_believed(samples: Path, endpoint: str, tmp_path: Path) -> None:
+def test_a_router_of_another_authority_is_not_trusted(samples: Path, endpoint: str, tmp_path: Path) -> None:
     openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", "/CN=rogue",
             "-days", 2, "-keyout", tmp_path / "ca.key", "-out", tmp_path / "ca.pem")  # fmt: skip
     text = (samples / "reader.json5").read_text().replace(f"{samples}/ca.pem", str(tmp_path / "ca.pem"))

@@ -42,13 +42,13 @@ with zenoh.open(config) as session, session.declare_subscriber("fusiond/*/state"
         sample = samples.get(timeout=15)
         payload = sample.payload.to_bytes()
         as_json = str(sample.encoding) == "application/json"
-        told = json.loads(payload) if as_json else msgspec.msgpack.decode(payload)
+        message = json.loads(payload) if as_json else msgspec.msgpack.decode(payload)
         row = [""] * 14
-        if told["state"]:
-            s = told["state"]
+        if message["state"]:
+            s = message["state"]
             row = [s["lat_deg"], s["lon_deg"], s["height_m"], *s["velocity_ned_mps"], s["roll_deg"], s["pitch_deg"],
                    s["yaw_deg"], *s["sigma_position_ned_m"], s["sigma_velocity_mps"], s["sigma_yaw_deg"]]
-        row = ",".join([str(told["t_ns"] // 1000), *(x if x == "" else repr(x) for x in row), told["mode"]])
+        row = ",".join([str(message["t_ns"] // 1000), *(x if x == "" else repr(x) for x in row), message["mode"]])
         sent_as = [str(sample.key_expr), str(sample.encoding), str(sample.priority), sample.express]
         print(json.dumps([*sent_as, payload.hex(), row]), flush=True)
 """
@@ -62,7 +62,7 @@ def wait_for_reader(publisher: ZenohPublisher) -> None:
             matched.set()
 
     with publisher._publishers[state_key("rover")].declare_matching_listener(watch):
-        assert publisher.matched or matched.wait(DEADLINE), "nobody subscribed"
+        assert publisher.matched or matched.wait(DEADLINE), "no subscriber"
 
 
 @pytest.mark.parametrize("encoding", get_args(Encoding))
@@ -163,7 +163,7 @@ def complaint(section: Zenoh, directory: Path = Path()) -> str:
     return text
 
 
-def test_a_taken_port_is_named() -> None:
+def test_a_port_in_use_is_named() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -177,7 +177,7 @@ def test_a_bad_endpoint_is_named(endpoint: str) -> None:
     assert endpoint in complaint(Zenoh(listen=[endpoint]))
 
 
-def test_a_client_with_nobody_to_connect_to_is_told_so() -> None:
+def test_a_client_without_anything_to_connect_to_is_reported() -> None:
     assert "No peer specified" in complaint(Zenoh(mode="client"))
     assert "Unable to connect" in complaint(Zenoh(mode="client", connect=[f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"]))
 

@@ -1,4 +1,4 @@
-"""The command line: what it writes, how it refuses, and that no input makes it fall over."""
+"""The command line: its output, its errors, and that no input makes it crash."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 @pytest.fixture
 def replay(run: Run, folder: Path) -> Run:
-    """`fusiond replay` of the drive; arguments that are logs by their suffix take the place of its own."""
+    """`fusiond replay` of the drive; arguments that are logs by their suffix replace its own."""
 
     def command(*arguments: object) -> tuple[int, str, str]:
         logs = [a for a in map(str, arguments) if a.removesuffix(".gz").endswith((".tlog", ".log"))]
@@ -80,7 +80,7 @@ def replay(run: Run, folder: Path) -> Run:
     return command
 
 
-# --- What it writes
+# --- Output
 
 
 def test_replay_writes_track_summary_and_text(replay: Run, folder: Path, tmp_path: Path) -> None:
@@ -186,21 +186,21 @@ def test_demo(run: Run, tmp_path: Path) -> None:
     code, out, _ = run("demo", "--out", tmp_path / "out" / "demo")
     assert code == SUCCESS
     assert "WITH BAD GNSS" in out
-    told = " ".join(out.split())
-    assert re.search(r"replayed, gives (\d+) of \1 alike", told)
-    assert ", 0 of them lost on their way, 0 in full queues" in told
+    text = " ".join(out.split())
+    assert re.search(r"A replay of the recording gives (\d+) of \1 identical states", text)
+    assert ", 0 not received, 0 dropped from full queues" in text
     written = {path.name for path in (tmp_path / "out" / "demo").iterdir()}
     assert written == {"track.csv", "summary.json", "track.png"}
 
 
-def test_check_says_what_will_happen(run: Run, folder: Path) -> None:
+def test_check_explains_the_configuration(run: Run, folder: Path) -> None:
     code, out, err = run("check", "--config", folder / "fusiond.toml")
     assert (code, err) == (SUCCESS, "")
     for part in ("vehicle      tested", "WHEEL_SPEEDS.SPEED_FL", "fusiond/tested/state at 50 Hz", "can be used\n"):
         assert part in out
 
 
-def test_check_warns_of_what_is_odd(run: Run, folder: Path) -> None:
+def test_check_warns_of_oddities(run: Run, folder: Path) -> None:
     odd = folder / "odd.toml"
     text = (folder / "fusiond.toml").read_text()
     odd.write_text(text.replace("velocity_delay_ms = 0", "velocity_delay_ms = 1500"))
@@ -214,7 +214,7 @@ def test_check_warns_of_what_is_odd(run: Run, folder: Path) -> None:
     assert "no [wheel.NAME]" in out
 
 
-def test_logs_of_one_name_are_told_apart(replay: Run, folder: Path, tmp_path: Path) -> None:
+def test_logs_of_one_name_are_distinguished(replay: Run, folder: Path, tmp_path: Path) -> None:
     lines = (folder / "drive.log").read_text().splitlines(keepends=True)
     halves = [lines[: len(lines) // 2], lines[len(lines) // 2 :]]
     for name, half in zip("ab", halves, strict=True):
@@ -231,7 +231,7 @@ def test_logs_of_one_name_are_told_apart(replay: Run, folder: Path, tmp_path: Pa
     }
 
 
-# --- How it refuses
+# --- Errors
 
 
 def test_help_and_version(run: Run) -> None:
@@ -261,7 +261,7 @@ def test_wrong_usage(replay: Run, arguments: list[str], complaint: str) -> None:
     assert complaint in err
 
 
-def test_wrong_configuration_is_told_by_line(run: Run, folder: Path) -> None:
+def test_wrong_configuration_is_reported_by_line(run: Run, folder: Path) -> None:
     for text, complaint in (
         ("[vehicle\n", "not valid TOML"),
         ("[vehicle]\nnam = 'x'\n", "bad.toml:2: vehicle.nam: unknown key; allowed: geoid_m, name"),
@@ -309,7 +309,7 @@ def test_bad_truth(replay: Run, folder: Path, tmp_path: Path) -> None:
     assert "cannot be read" in replay("--truth", tmp_path / "absent.csv")[2]
 
 
-def test_a_truth_of_another_drive_is_remarked(replay: Run, tmp_path: Path) -> None:
+def test_a_truth_of_another_drive_is_a_warning(replay: Run, tmp_path: Path) -> None:
     other = tmp_path / "other.csv"
     other.write_text("unix_us,lat_deg,lon_deg,height_m,vn_mps,ve_mps,yaw_deg\n1,48,11,500,0,0,0\n2,48,11,500,0,0,0\n")
     code, out, _ = replay("--truth", other)
@@ -360,7 +360,7 @@ def test_a_damaged_log_is_used_as_far_as_it_goes(replay: Run, folder: Path, tmp_
 
 @pytest.mark.parametrize("name", ["drive.tlog", "drive.log", "drive.tlog.gz", "drive.log.gz"])
 @pytest.mark.parametrize("kind", ["empty", "garbage"])
-def test_what_is_no_log_is_refused(replay: Run, folder: Path, tmp_path: Path, name: str, kind: str) -> None:
+def test_a_file_that_is_no_log_is_refused(replay: Run, folder: Path, tmp_path: Path, name: str, kind: str) -> None:
     (tmp_path / name).write_bytes(damaged(b"", kind))
     code, _, err = replay(tmp_path / name)
     assert code == UNUSABLE
@@ -384,7 +384,7 @@ def test_interleaved_logs(replay: Run, folder: Path, tmp_path: Path) -> None:
         assert met.keys() & {"bad bytes", "bad lines"}
 
 
-def test_logs_swapped_or_of_no_use(replay: Run, folder: Path, tmp_path: Path) -> None:
+def test_logs_swapped_or_unusable(replay: Run, folder: Path, tmp_path: Path) -> None:
     swapped = tmp_path / "swapped.tlog"
     swapped.write_bytes((folder / "drive.log").read_bytes())
     code, _, err = replay(swapped)

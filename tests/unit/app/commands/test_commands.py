@@ -16,13 +16,13 @@ HEAVY = (
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_each_has_a_grammar_and_an_action(name: str) -> None:
+def test_each_has_arguments_and_an_action(name: str) -> None:
     module = import_module(f"fusiond.app.commands.{name}")
     assert callable(module.fill) and callable(module.run)
     assert module.__doc__ and module.__doc__.startswith(f"fusiond {name}: ")
 
 
-def test_the_daemon_pays_for_no_other_command() -> None:
+def test_the_daemon_imports_no_other_command() -> None:
     """Its grammar imports next to nothing; all of the daemon no module of another command."""
     code = (
         "import sys, fusiond.__main__ as m; m.parser('run'); print(*sys.modules)\n"

@@ -28,7 +28,7 @@ def manager(tmp_path: Path) -> Iterator[socket.socket]:
         yield made
 
 
-def told(manager: socket.socket, what: str) -> str:
+def notified(manager: socket.socket, what: str) -> str:
     """The next notification that begins so."""
     while True:
         text = manager.recv(4096).decode()
@@ -46,7 +46,7 @@ def test_life_of_the_process(tmp_path: Path, manager: socket.socket) -> None:
     command = [sys.executable, "-m", "fusiond", "run", "--config", str(file)]
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
         try:
-            told(manager, "READY=1")
+            notified(manager, "READY=1")
             states: queue.Queue[bytes] = queue.Queue()
             client = zenoh.Config()
             client.insert_json5("mode", '"client"')
@@ -59,13 +59,13 @@ def test_life_of_the_process(tmp_path: Path, manager: socket.socket) -> None:
                 peer.sendto(Autopilot().imu(), ("127.0.0.1", udp))
                 message = decode(states.get(timeout=DEADLINE), StateMessage, "json")
                 assert (message.vehicle, message.mode.value) == ("test", "aligning")
-            assert told(manager, "WATCHDOG=1") != told(manager, "WATCHDOG=1")  # the status goes on
+            assert notified(manager, "WATCHDOG=1") != notified(manager, "WATCHDOG=1")  # the status goes on
             file.write_text(file.read_text().replace("heading_deg = 30.0", "heading_deg = 31.0"))
             process.send_signal(signal.SIGHUP)
-            told(manager, "RELOADING=1")
-            told(manager, "READY=1")
+            notified(manager, "RELOADING=1")
+            notified(manager, "READY=1")
             process.send_signal(signal.SIGTERM)
-            told(manager, "STOPPING=1")
+            notified(manager, "STOPPING=1")
             _, log = process.communicate(timeout=DEADLINE)
         finally:
             if process.poll() is None:
@@ -95,4 +95,4 @@ def test_a_dbc_that_does_not_fit_is_exit_code_2_and_never_up(tmp_path: Path, man
     assert "Traceback" not in done.stderr
     manager.settimeout(0)
     with pytest.raises(BlockingIOError):
-        told(manager, "READY=1")
+        notified(manager, "READY=1")

@@ -1,4 +1,4 @@
-"""The demonstration, with a short drive in place of the bundled one: published meanwhile, or told why not."""
+"""The demonstration with a short drive instead of the bundled one: publication, and a port in use."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from fusiond.app.demo import demo
 from fusiond.config.outputs import Zenoh
 from fusiond.config.schema import Config
 from fusiond.messages import HealthMessage, StateMessage
+from fusiond.units import SECOND
 from tests.helpers.drive import LOGS, folder
 
 DEADLINE = 15.0  # s
@@ -24,7 +25,7 @@ DEADLINE = 15.0  # s
 
 @pytest.fixture
 def port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
-    """Where the demonstration is published: with the drive of the tests, on a free port."""
+    """The port of the demonstration, with the drive of the tests."""
     for name in (*LOGS, "fusiond.toml", "wheels.dbc"):
         (tmp_path / name).write_bytes((folder() / name).read_bytes())
     (tmp_path / "truth.csv.gz").write_bytes(gzip.compress((folder() / "truth.csv").read_bytes()))
@@ -34,9 +35,9 @@ def port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     settings: Callable[[str], Config] = demo._settings
     monkeypatch.setattr(demo, "DRIVE", tmp_path)
     monkeypatch.setattr(demo, "LOGS", LOGS)
-    monkeypatch.setattr(demo, "LENGTH_NS", 8_000_000_000)
+    monkeypatch.setattr(demo, "LENGTH_NS", 8 * SECOND)
     monkeypatch.setattr(
-        demo, "_settings", lambda box: replace(settings(box), zenoh=Zenoh(listen=[f"tcp/127.0.0.1:{number}"]))
+        demo, "_settings", lambda folder: replace(settings(folder), zenoh=Zenoh(listen=[f"tcp/127.0.0.1:{number}"]))
     )
     return number
 
@@ -65,7 +66,7 @@ def test_it_is_published_for_top(port: int, tmp_path: Path, capsys: pytest.Captu
     assert "fusiond top" in capsys.readouterr().out
 
 
-def test_a_taken_port_is_told_at_once(port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_in_use_is_reported_at_once(port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", port)):
         assert main(["demo", "--publish", "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "zenoh: cannot open" in capsys.readouterr().err

@@ -73,7 +73,7 @@ def replayed(file: Path) -> list[Message]:
 
 
 def numbers(message: Message) -> dict[str, Any]:
-    """All of a message, but for what the health says of the shell."""
+    """A message, without the health of inputs and outputs."""
     table: dict[str, Any] = msgspec.json.decode(encode(message, "json"))
     return {name: value for name, value in table.items() if name not in SHELL}
 
@@ -85,7 +85,7 @@ def kind_of(where: str) -> type[Message]:
 def test_publish_sends_all_that_a_live_run_sends_and_loses_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As fast as it goes, to a reader that takes its time with each message, with a health that tells of the output."""
+    """At full speed, to a reader that is slow with each message, with the health of the output."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     file = configured(tmp_path, f'\n[zenoh]\nmode = "client"\nlisten = []\nconnect = ["{endpoint}"]\n')
     received: list[Message] = []

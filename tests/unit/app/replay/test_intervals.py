@@ -27,7 +27,7 @@ def setup() -> Config:
         (":1-2", "there is no source ''"),
     ],
 )
-def test_what_cannot_be_withheld(setup: Config, text: str, complaint: str) -> None:
+def test_wrong_intervals_and_sources_are_refused(setup: Config, text: str, complaint: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse_withheld(text, setup)
     assert complaint in str(caught.value)

@@ -1,4 +1,4 @@
-"""Replay: when ticks are made and what they tell, what is withheld, and what the summary counts."""
+"""Replay: the instants and messages of ticks, withheld sources, and the counts of the summary."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_another_sensor_does_not_end_the_wait(setup: Config, monkeypatch: pytest
     assert order == [(0, 0), (120 * MS, 120 * MS)]
 
 
-def test_a_tick_that_waited_tells_of_the_sample_that_it_waited_for(setup: Config, events: list[Received]) -> None:
+def test_a_tick_that_waited_has_the_state_at_its_sample(setup: Config, events: list[Received]) -> None:
     """Which is no older than the simulated transport takes; without waiting it is up to 10 ms older."""
     waiting, ages = replace(setup, publish=replace(setup.publish, on_imu=True)), {}
     for settings in (setup, waiting):
@@ -146,14 +146,14 @@ def test_a_tick_that_waited_tells_of_the_sample_that_it_waited_for(setup: Config
     assert max(ages[True]) < 2.5 < statistics.median(ages[False])
 
 
-def test_ticks_tell_what_a_live_fusion_would(setup: Config, events: list[Received]) -> None:
-    told: dict[int, str] = {}
+def test_ticks_have_the_state_of_a_live_fusion(setup: Config, events: list[Received]) -> None:
+    published: dict[int, str] = {}
 
     def tick(message: StateMessage, _: Errors | None) -> None:
-        told[message.t_ns] = csv_row(message)
+        published[message.t_ns] = csv_row(message)
 
     Replay(setup, ReplayTask(RATE, on_tick=[tick])).run(events)
-    checked = list(told)[1::40]
+    checked = list(published)[1::40]
     live = Fusion(setup)
     waiting = iter(events)
     event = next(waiting)
@@ -162,8 +162,8 @@ def test_ticks_tell_what_a_live_fusion_would(setup: Config, events: list[Receive
             live.feed(event)
             event = next(waiting)
         outcomes = OutcomeCounts(**{name.lower(): count for name, count in live.totals().items()})
-        assert told[t_ns] == csv_row(state_message(live.solution_at(t_ns), setup.vehicle.name, outcomes))
-    assert told[checked[-1]].endswith("nominal")
+        assert published[t_ns] == csv_row(state_message(live.solution_at(t_ns), setup.vehicle.name, outcomes))
+    assert published[checked[-1]].endswith("nominal")
 
 
 def test_a_receipt_that_runs_back_does_not_turn_time_back(setup: Config) -> None:
@@ -173,7 +173,7 @@ def test_a_receipt_that_runs_back_does_not_turn_time_back(setup: Config) -> None
     assert replay.events == 4
 
 
-def test_ticks_stop_in_a_hole_and_go_on_upon_the_grid(setup: Config) -> None:
+def test_ticks_stop_in_a_gap_and_continue_on_the_grid(setup: Config) -> None:
     hole = 2 * 3600 * SECOND + 7 * MS
     replay, instants = ticks_of(setup, [imu(T0), imu(T0 + hole, 1), imu(T0 + hole + SECOND, 2)], rate_hz=10.0)
     before = [t for t in instants if t < hole]
@@ -187,7 +187,7 @@ def test_ticks_stop_in_a_hole_and_go_on_upon_the_grid(setup: Config) -> None:
     assert summary.published.rows + summary.published.skipped == 10 * 2 * 3600 + 11
 
 
-def test_without_a_taker_there_are_no_ticks(setup: Config, events: list[Received]) -> None:
+def test_without_a_sink_there_are_no_ticks(setup: Config, events: list[Received]) -> None:
     replay = Replay(setup, ReplayTask(RATE))
     replay.run(events)
     summary = replay.summary("c.toml", {}, [])
@@ -196,7 +196,7 @@ def test_without_a_taker_there_are_no_ticks(setup: Config, events: list[Received
     assert summary.final.state is not None
 
 
-def test_pace_is_asked_before_every_event_and_tick(setup: Config) -> None:
+def test_pace_is_called_before_every_event_and_tick(setup: Config) -> None:
     asked: list[int] = []
     replay = Replay(setup, ReplayTask(10.0, pace=asked.append, on_tick=[lambda *_: None]))
     replay.run([imu(T0), imu(T0 + 250 * MS, 1)])

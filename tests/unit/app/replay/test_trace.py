@@ -1,4 +1,4 @@
-"""What a picture is drawn from: thinned samples, fixes by their outcome, and what asking for that costs."""
+"""The data of a picture: thinned samples, fixes by their outcome, and the cost of reading it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def events() -> list[Received]:
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 0.5])
-def test_every_fix_is_drawn_as_what_became_of_it(events: list[Received], rate_hz: float) -> None:
+def test_every_fix_is_drawn_by_its_outcome(events: list[Received], rate_hz: float) -> None:
     trace = Trace()
     receipts: list[Receipt] = []
     task = ReplayTask(rate_hz, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt, receipts.append])
@@ -45,7 +45,7 @@ def test_every_fix_is_drawn_as_what_became_of_it(events: list[Received], rate_hz
     )
 
 
-def test_it_has_no_rows_run_again(events: list[Received]) -> None:
+def test_it_causes_no_rewind(events: list[Received]) -> None:
     rerun = []
     for traced in (False, True):
         trace = Trace()

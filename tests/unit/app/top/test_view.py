@@ -1,4 +1,4 @@
-"""`fusiond top`: what it shows of messages, and the command itself, over real Zenoh and on a real terminal."""
+"""`fusiond top`: its screen, and the command itself, over real Zenoh and on a real terminal."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from tests.helpers.network import DEADLINE, free_port
 CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
-def view_of(*told: Message) -> View:
+def view_of(*published: Message) -> View:
     view = View()
-    for message in told:
+    for message in published:
         view.add(message)
     return view
 
@@ -43,9 +43,9 @@ def texts(lines: list[Line]) -> list[str]:
 
 def until(mode: Mode) -> list[Message]:
     """The messages up to the first health in a mode."""
-    told = list(messages())
-    last = next(i for i, m in enumerate(told) if isinstance(m, HealthMessage) and m.mode is mode and i > 100)
-    return told[: last + 1]
+    published = list(messages())
+    last = next(i for i, m in enumerate(published) if isinstance(m, HealthMessage) and m.mode is mode and i > 100)
+    return published[: last + 1]
 
 
 def colour_of(lines: list[Line], text: str) -> str:
@@ -56,11 +56,11 @@ def colour_of(lines: list[Line], text: str) -> str:
 
 
 def test_state_sources_and_events() -> None:
-    told = until(Mode.DEAD_RECKONING)
-    state = [message for message in told if isinstance(message, StateMessage)][-1]
-    health = told[-1]
+    published = until(Mode.DEAD_RECKONING)
+    state = [message for message in published if isinstance(message, StateMessage)][-1]
+    health = published[-1]
     assert state.state is not None and isinstance(health, HealthMessage)
-    lines = screen(view_of(*told), 0.0, 200, 100)
+    lines = screen(view_of(*published), 0.0, 200, 100)
     text = "\n".join(texts(lines))
     assert text.startswith("tested  dead reckoning")
     assert f"{state.state.lat_deg:.7f} N" in text and f"{state.state.sigma_yaw_deg:.2f}" in text and " 50 Hz" in text
@@ -115,7 +115,7 @@ def test_it_fits_any_terminal(width: int, height: int) -> None:
     assert plain(lines[-1]).startswith("... ") == (height < 100)
 
 
-def test_no_message_steers_the_terminal() -> None:
+def test_no_message_controls_the_terminal() -> None:
     event = next(message for message in messages() if isinstance(message, EventMessage))
     lines = screen(view_of(msgspec.structs.replace(event, text="\x1b[2J\x07\n")), 0.0, 80, 24)
     assert plain(lines[-1]).endswith("?[2J??")
@@ -127,9 +127,9 @@ def test_no_message_steers_the_terminal() -> None:
 
 @contextmanager
 def published(vehicle: str = "tested") -> Iterator[int]:
-    """A vehicle that is dead reckoning, told again and again over Zenoh; its port."""
-    told = until(Mode.DEAD_RECKONING)
-    again = [message for message in told if isinstance(message, StateMessage)][-1], told[-1]
+    """The port of a vehicle that is dead reckoning, published repeatedly over Zenoh."""
+    published = until(Mode.DEAD_RECKONING)
+    again = [message for message in published if isinstance(message, StateMessage)][-1], published[-1]
     port, stop = free_port(socket.SOCK_STREAM), Event()
     with (
         open_session(Zenoh(listen=[f"tcp/127.0.0.1:{port}"])) as session,
@@ -158,7 +158,7 @@ def test_once_prints_a_screen(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.startswith("tested  dead reckoning") and "\x1b" not in out and "gps0.position" in out
 
 
-def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_fusiond_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--connect", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", "--once"]) == UNUSABLE
     assert "Unable to connect" in capsys.readouterr().err
     port = free_port(socket.SOCK_STREAM)
