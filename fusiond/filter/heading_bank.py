@@ -33,13 +33,13 @@ from fusiond.filter.state import (
     NEVER,
     PHASE,
     POSITION_E,
-    RESET_REASON,
-    RESETS,
     RUNNING,
     T_JUDGED,
     FilterState,
     ResetReason,
     Verdict,
+    count_reset,
+    is_finite,
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp
@@ -153,9 +153,13 @@ def _roll(state: FilterState, params: Parameters) -> None:
 
 @compiled
 def normalise(state: FilterState) -> None:
-    """Let the weights sum to 1, and give up those that have become too small."""
+    """Let the weights sum to 1. Give up the hypotheses that are no longer finite, and those that have become too
+    unlikely."""
     total = 0.0
     for i in range(HYPOTHESES):
+        hypothesis = state.hypothesis(i)
+        if not (state.bank[i, 0] > 0 and math.isfinite(state.bank[i, 0]) and is_finite(hypothesis)):
+            state.bank[i, 0] = 0.0
         total += state.bank[i, 0]
     for i in range(HYPOTHESES):
         state.bank[i, 0] = state.bank[i, 0] / total if total > 0 else 0.0
@@ -229,7 +233,6 @@ def _collapse(state: FilterState, best: int, errors: ErrorRows3) -> None:
     state.bank[:] = 0.0
     state.stamps[PHASE] = RUNNING
     if state.stamps[HOT_START] == Verdict.USED:  # its state was published meanwhile
-        state.stamps[RESETS] += 1
-        state.stamps[RESET_REASON] = ResetReason.HEADING_DECIDED
+        count_reset(state, ResetReason.HEADING_DECIDED)
     for source in range(state.sources):
         state.source_stamps[source, T_JUDGED] = NEVER

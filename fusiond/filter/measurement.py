@@ -30,7 +30,6 @@ from fusiond.filter.state import (
     LOWEST_SPEED,
     NEVER,
     POSITION_E,
-    RESET_REASON,
     RESET_SOURCE,
     T_BACK,
     T_FUSED,
@@ -40,8 +39,8 @@ from fusiond.filter.state import (
     T_SAME_ERROR,
     FilterState,
     ResetReason,
+    count_reset,
 )
-from fusiond.filter.state import RESETS as RESET_COUNT
 from fusiond.maths.typed import Stamps, Vector, compiled
 from fusiond.maths.wgs84 import mat_ne
 
@@ -172,8 +171,7 @@ def _reset(state: FilterState, source: int, seen: Observation, block: int) -> No
         _reset_offset(state, seen)
         return
     _reset_block(state, seen, block)
-    state.stamps[RESET_COUNT] += 1
-    state.stamps[RESET_REASON] = ResetReason.SOURCE_RETURNED
+    count_reset(state, ResetReason.SOURCE_RETURNED)
     state.stamps[RESET_SOURCE] = source
 
 

@@ -8,11 +8,12 @@ other. North-east-down is made where people and messages want it (`fusiond.estim
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 
 import numpy as np
 
-from fusiond.maths.typed import Array, Stamps
+from fusiond.maths.typed import Array, Stamps, compiled
 
 
 class _Layout:
@@ -225,3 +226,21 @@ class FilterState:
         twin = FilterState(len(self.memory), self.size)
         twin.copy_from(self)
         return twin
+
+
+@compiled
+def is_finite(state: FilterState) -> bool:
+    """Whether the nominal state and its variances are finite."""
+    total = 0.0
+    for i in range(len(state.nominal)):
+        total += state.nominal[i]
+    for i in range(state.size):
+        total += state.covariance[i, i]
+    return math.isfinite(total)
+
+
+@compiled
+def count_reset(state: FilterState, reason: int) -> None:
+    """Count a reset of the state, and keep its ResetReason."""
+    state.stamps[RESETS] += 1
+    state.stamps[RESET_REASON] = reason

@@ -35,7 +35,6 @@ from fusiond.filter.state import (
     POSITION_E,
     RATE_B,
     RATE_VARIANCE,
-    RESET_REASON,
     RESETS,
     RUNNING,
     T_FUSED,
@@ -45,6 +44,8 @@ from fusiond.filter.state import (
     FilterState,
     ResetReason,
     T,
+    count_reset,
+    is_finite,
 )
 from fusiond.filter.strapdown import COAST_RATE, COAST_TURN, coast, propagate
 from fusiond.maths.portable import square
@@ -68,8 +69,7 @@ def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> N
         initial_alignment.gather_motion(state, row, params)
     elif state.stamps[PHASE] == CHOOSING:
         _choose(state, row, imu, params)
-        if state.stamps[PHASE] == CHOOSING:
-            _guard_bank(state)
+        guard(state)
     else:
         coasted = coasts(state, t_ns, params)
         advance(state, t_ns, imu, params)
@@ -109,7 +109,7 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
         return
     if stamps[PHASE] == EMPTY or t_ns - stamps[T] > params.restart_gap_ns:
         if stamps[PHASE] == RUNNING:
-            _count_reset(state, ResetReason.DATA_GAP)
+            count_reset(state, ResetReason.DATA_GAP)
         initial_alignment.begin(state)
     row["outcome"] = Outcome.FUSED
     if stamps[PHASE] == ALIGNING:
@@ -117,7 +117,7 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
     else:  # the IMU is back
         advance(state, t_ns, imu, params)
         if yaw_variance(state) > square(LOST_HEADING) and _heard_gnss(state, params):
-            _count_reset(state, ResetReason.HEADING_LOST)
+            count_reset(state, ResetReason.HEADING_LOST)
             initial_alignment.begin(state)
             initial_alignment.gather(state, row, params)
         else:
@@ -125,11 +125,6 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
             constrain(state, params)
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
-
-
-def _count_reset(state: FilterState, reason: ResetReason) -> None:
-    state.stamps[RESETS] += 1
-    state.stamps[RESET_REASON] = reason
 
 
 def _heard_gnss(state: FilterState, params: Parameters) -> bool:
@@ -285,43 +280,17 @@ def hold(state: FilterState, values: Vector, t_ns: int) -> None:
 
 @compiled
 def guard(state: FilterState) -> None:
-    """If the state is no longer finite, empty it and align again. Never expected; counted where it happens."""
-    if _is_finite(state):
+    """If the state is no longer finite, or no hypothesis is left, empty it and align again. Never expected; counted."""
+    if state.stamps[PHASE] == CHOOSING:
+        for i in range(HYPOTHESES):
+            if state.bank[i, 0] > 0:
+                return
+    elif is_finite(state):
         return
-    _start_over(state)
-
-
-@compiled
-def _guard_bank(state: FilterState) -> None:
-    """Give up the hypotheses that are no longer finite; where none is left, align again."""
-    kept = 0
-    for i in range(HYPOTHESES):
-        hypothesis = state.hypothesis(i)
-        if state.bank[i, 0] > 0 and _is_finite(hypothesis):
-            kept += 1
-        else:
-            state.bank[i, 0] = 0.0
-    if kept == 0:
-        _start_over(state)
-
-
-@compiled
-def _is_finite(state: FilterState) -> bool:
-    total = 0.0
-    for i in range(len(state.nominal)):
-        total += state.nominal[i]
-    for i in range(state.size):
-        total += state.covariance[i, i]
-    return math.isfinite(total)
-
-
-@compiled
-def _start_over(state: FilterState) -> None:
-    """Empty the state, and count it."""
     resets, blown = int(state.stamps[RESETS]), int(state.stamps[BLOWN])
     state.clear()
-    state.stamps[RESETS], state.stamps[BLOWN] = resets + 1, blown + 1
-    state.stamps[RESET_REASON] = ResetReason.NOT_FINITE
+    state.stamps[RESETS], state.stamps[BLOWN] = resets, blown + 1
+    count_reset(state, ResetReason.NOT_FINITE)
 
 
 # --- The table of events

@@ -476,8 +476,12 @@ cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
 cdef void heading_bank_normalise(State* state) noexcept nogil:
     cdef double total
     cdef int64_t i
+    cdef State hypothesis
     total = 0.0
     for i in range(13):
+        hypothesis = hypothesis_of(state, i)
+        if (not ((state.bank[(i) * BLOCK + 0] > 0) and isfinite(state.bank[(i) * BLOCK + 0]) and state_is_finite(&hypothesis))):
+            state.bank[(i) * BLOCK + 0] = 0.0
         total += state.bank[(i) * BLOCK + 0]
     for i in range(13):
         state.bank[(i) * BLOCK + 0] = ((state.bank[(i) * BLOCK + 0] / total) if (total > 0) else 0.0)
@@ -584,8 +588,7 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
         state.bank[_i] = 0.0
     state.stamps[9] = 2
     if (state.stamps[20] == 1):
-        state.stamps[10] += 1
-        state.stamps[18] = 5
+        state_count_reset(state, 5)
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
 
@@ -777,8 +780,7 @@ cdef void measurement__reset(State* state, int64_t source, Observation* seen, in
         measurement__reset_offset(state, seen)
         return
     measurement__reset_block(state, seen, block)
-    state.stamps[10] += 1
-    state.stamps[18] = 4
+    state_count_reset(state, 4)
     state.stamps[19] = source
 
 cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
@@ -2015,6 +2017,22 @@ cdef bint source_health_moved(double* memory, double* innovation, double* varian
         memory[(14 + a)] = innovation[a]
     return (not (total <= gate))
 
+# ---------------- fusiond.filter.state
+
+cdef bint state_is_finite(State* state) noexcept nogil:
+    cdef double total
+    cdef int64_t i
+    total = 0.0
+    for i in range(NOMINAL_SIZE):
+        total += state.nominal[i]
+    for i in range(n):
+        total += state.covariance[(i) * n + i]
+    return isfinite(total)
+
+cdef void state_count_reset(State* state, int64_t reason) noexcept nogil:
+    state.stamps[10] += 1
+    state.stamps[18] = reason
+
 # ---------------- fusiond.filter.step
 
 cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexcept nogil:
@@ -2033,8 +2051,7 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
         initial_alignment_gather_motion(state, row, params)
     elif (state.stamps[9] == 3):
         step__choose(state, row, imu, params)
-        if (state.stamps[9] == 3):
-            step__guard_bank(state)
+        step_guard(state)
     else:
         coasted = step_coasts(state, t_ns, params)
         step_advance(state, t_ns, imu, params)
@@ -2265,41 +2282,19 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
         a[(9 + i)] = _t2
 
 cdef void step_guard(State* state) noexcept nogil:
-    if step__is_finite(state):
-        return
-    step__start_over(state)
-
-cdef void step__guard_bank(State* state) noexcept nogil:
-    cdef int64_t kept
     cdef int64_t i
-    cdef State hypothesis
-    kept = 0
-    for i in range(13):
-        hypothesis = hypothesis_of(state, i)
-        if ((state.bank[(i) * BLOCK + 0] > 0) and step__is_finite(&hypothesis)):
-            kept += 1
-        else:
-            state.bank[(i) * BLOCK + 0] = 0.0
-    if (kept == 0):
-        step__start_over(state)
-
-cdef bint step__is_finite(State* state) noexcept nogil:
-    cdef double total
-    cdef int64_t i
-    total = 0.0
-    for i in range(NOMINAL_SIZE):
-        total += state.nominal[i]
-    for i in range(n):
-        total += state.covariance[(i) * n + i]
-    return isfinite(total)
-
-cdef void step__start_over(State* state) noexcept nogil:
     cdef int64_t resets
     cdef int64_t blown
+    if (state.stamps[9] == 3):
+        for i in range(13):
+            if (state.bank[(i) * BLOCK + 0] > 0):
+                return
+    elif state_is_finite(state):
+        return
     resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
     clear_state(state)
-    state.stamps[10], state.stamps[17] = (resets + 1), (blown + 1)
-    state.stamps[18] = 3
+    state.stamps[10], state.stamps[17] = resets, (blown + 1)
+    state_count_reset(state, 3)
 
 cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int64_t source, int64_t sequence) noexcept nogil:
     cdef int64_t i

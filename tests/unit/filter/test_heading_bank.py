@@ -58,8 +58,9 @@ def test_in_reverse_with_wheels_that_do_not_tell(seed: int) -> None:
     assert abs(error) < 3 * sigma
 
 
+@pytest.mark.parametrize("column", [0, 1, -1], ids=["weight", "position", "variance"])
 @pytest.mark.parametrize("whole", [False, True])
-def test_hypotheses_that_are_not_finite_are_given_up(compiled: bool, whole: bool) -> None:
+def test_hypotheses_that_are_not_finite_are_given_up(compiled: bool, whole: bool, column: int) -> None:
     """The others go on; where none is left the filter aligns anew. Neither publishes what is not finite."""
     truth = departing(2.0)
     fusion, poisoned = Fusion(config(), compiled), False
@@ -68,7 +69,7 @@ def test_hypotheses_that_are_not_finite_are_given_up(compiled: bool, whole: bool
         for event in measurements(truth):
             if not poisoned and head.stamps[PHASE] == CHOOSING and event.t_ns > T0 + SECOND:
                 poisoned = True
-                head.bank[:: 1 if whole else 4, -1] = math.nan  # the last variance of each, or of every fourth
+                head.bank[:: 1 if whole else 4, column] = math.nan  # of each, or of every fourth
             fusion.fuse(event)
             state = fusion.solution_at(int(head.stamps[T])).state
             assert state is None or math.isfinite(sum(state.velocity_n) + state.covariance.sum())
