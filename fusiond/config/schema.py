@@ -45,8 +45,8 @@ class Filter(Section, frozen=True, kw_only=True):
     imu_gap_s: Seconds = 0.2  # an IMU that is silent for longer is bridged by coasting
     restart_gap_s: Seconds = 30.0  # after a gap of this length in the data the filter aligns again
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good measurements that pass the innovation gate
-    gnss_reset_s: Seconds = 30.0  # GNSS rejected for this long with a consistent offset is trusted again
-    gnss_return_s: Seconds = 3.0  # the same, if no fix was fused in the 10 s before
+    spoof_cost: Positive = 3.0  # what a metre costs by which a lying receiver pulls the state, against the next
+    dead_reckoning_cost: Positive = 1.0  # what a metre costs by which dead reckoning drifts off a receiver that was right
     v_max_mps: Positive = 60.0  # top speed of the vehicle: the initial velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # heading at the first start, clockwise from north
     heading_sigma_deg: Positive = 5.0  # sigma of the given start heading

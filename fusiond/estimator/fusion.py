@@ -117,6 +117,7 @@ class Fusion:
     def settled(self) -> Solution:
         """The solution at the horizon, which no late event can change any more."""
         state = self._published(self.history.settled())
+        self.history.kernel.predict(state, int(state.stamps[T]))
         return self._solution(state, int(state.stamps[T]))
 
     def hot_start(self) -> Verdict:

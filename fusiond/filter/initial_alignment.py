@@ -31,12 +31,14 @@ from fusiond.filter.source_health import arrive
 from fusiond.filter.state import (
     ACCEL_BIAS_B,
     ALIGNING,
+    ALIVE,
     ANTENNA_B,
     ANTENNA_ERROR,
     ATTITUDE,
     CHOOSING,
     DELAYS,
     DELAYS_ERROR,
+    EXCLUDED,
     FIRST_VELOCITY_N,
     FIX_E,
     FIX_VARIANCE,
@@ -46,6 +48,7 @@ from fusiond.filter.state import (
     HELD_FORCE_B,
     HELD_RATE_B,
     HOT_START,
+    INERTIAL_DOUBT,
     LAST_SPEED,
     MEAN_FORCE_B,
     MEAN_RATE_B,
@@ -60,6 +63,7 @@ from fusiond.filter.state import (
     REST_RATE_B,
     RUNNING,
     STORED,
+    SUSPECT,
     T_CONSTRAINT,
     T_FIRST_VELOCITY,
     T_FIX,
@@ -95,7 +99,9 @@ def begin(state: FilterState) -> None:
     """Forget everything but the biases and calibrations, and start to align."""
     state.stamps[[T, T_IMU, T_CONSTRAINT, T_STILL, T_FIRST_VELOCITY, T_FIX, T_REST, T_START, T_POSITION]] = NEVER
     state.stamps[PHASE] = ALIGNING
-    state.auxiliary[:] = 0.0
+    state.stamps[[ALIVE, SUSPECT]] = 0
+    state.auxiliary[:] = state.bank[:] = state.nominal[INERTIAL_DOUBT] = 0.0
+    state.memory[:, EXCLUDED] = 0.0
     state.source_stamps[:] = NEVER
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.filter import source_health
+from fusiond.filter import rivals, source_health
 from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, observe, wheel_speed
@@ -23,6 +23,9 @@ from fusiond.filter.observations.model import (
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Row
 from fusiond.filter.state import (
+    ALIVE,
+    BIASED,
+    EXCLUDED,
     HEIGHT_OFFSET,
     HEIGHT_OFFSET_ERROR,
     LAST_RATIO,
@@ -30,24 +33,18 @@ from fusiond.filter.state import (
     LOWEST_SPEED,
     NEVER,
     POSITION_E,
-    RESET_SOURCE,
-    T_BACK,
+    STATE_DOUBT,
+    SUSPECT,
     T_FUSED,
     T_LAST,
     T_POSITION,
     T_REJECTED,
-    T_SAME_ERROR,
     FilterState,
-    ResetReason,
-    count_reset,
 )
-from fusiond.maths.typed import Stamps, Vector, compiled
+from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
 from fusiond.maths.wgs84 import mat_ne
 
-BREAK_NS = 5_000_000_000  # rejections further apart do not belong together
 OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
-SUSPECT = 6  # times gnss_reset_s, where the receiver's motion is in question
-NEAR = 9.0  # test ratio up to which a fix after an outage is taken as right soon
 
 
 @compiled
@@ -107,72 +104,122 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     weight = factor_of(stamps, model, values, parameter, t_ns)
     if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
         stamps[T_FUSED] = NEVER
-        stamps[T_BACK] = t_ns
         source_health.begin(memory)
-    companion = int(parameter[COMPANION])
-    doubtful = disputed(state, source if model == GNSS_VELOCITY else companion, params)
+    by_rivals = model == GNSS_POSITION or model == GNSS_VELOCITY
+    doubtful = disputed(state, source if model == GNSS_VELOCITY else int(parameter[COMPANION]), params)
+    before = source_health.odds_of_bias(memory)
     if not doubtful:
-        if source_health.is_due(stamps, t_ns, correlation_of(model, values, parameter)):
-            whitened = np.empty(3)
-            known = stamps[T_FUSED] != NEVER and source_health.observes_sensor(spread, learnt, m)
-            if known and whiten(spread, seen.innovation, learnt, m, whitened):
-                source_health.judge(memory, stamps, whitened, m, same, t_ns)
+        whitened = np.empty(3)
+        if whiten(spread, seen.innovation, learnt, m, whitened):
+            _judge(state, source, whitened, m, same, t_ns, correlation_of(model, values, parameter), params)
         source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
-    trusted = source_health.is_trusted(memory) and (companion < 0 or source_health.is_trusted(state.memory[companion]))
+    trusted = source_health.is_used(memory, by_rivals)
     if model == WHEEL_SPEED and trusted:
         trusted = not carried(state, memory[LAST_SPEED], params)
     noisy = source_health.noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = learnt[a] * noisy
+    heard = not doubtful and not source_health.is_stuck(memory) and (trusted or by_rivals)
+    fits = rivals.likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0
     ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
     row["ratio"] = memory[LAST_RATIO] = ratio
-    if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, params):
-        _reset(state, source, seen, int(parameter[RESETS]))
+    if state.stamps[ALIVE] > 0 and heard:
+        main = fits if trusted else rivals.unread(seen.variance, weight, m, spread)
+        _fuse_rivals(state, source, values, factor * noisy, weight, main, params)
+    if by_rivals and not doubtful:
+        rivals.suspect_receiver(state, source, before, params)
+        if model == GNSS_POSITION and not fused:
+            _suspect_state(state, source, seen, params)
+    if trusted and heard:
+        rivals.watch_inertial(state, seen, weight, spread, fits)
+    if state.stamps[ALIVE] > 0:
+        rivals.decide(state, params)
+    if not fused and int(parameter[RESETS]) == HEIGHT_OFFSET_ERROR.start and memory[BIASED] > source_health.DISTRUST:
+        _reset_offset(state, seen)  # a barometer that is off by a constant has another offset now: weather, a window
         source_health.begin(memory)
         fused = True
     if fused:
-        stamps[T_REJECTED] = stamps[T_SAME_ERROR] = NEVER
+        stamps[T_REJECTED] = NEVER
         stamps[T_FUSED] = t_ns
         if model == GNSS_POSITION:
             state.stamps[T_POSITION] = t_ns
+            state.auxiliary[STATE_DOUBT] = 0.0
     elif stamps[T_REJECTED] == NEVER:
         stamps[T_REJECTED] = t_ns
     return fused
 
 
 @compiled
-def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, params: Parameters) -> bool:
-    """Whether a GNSS source has been rejected for long, with the same error all the time, so that the state is likelier
-    at fault: soon after an outage, or where the vehicle is carried, whose wheels have held the state back; later otherwise;
-    and much later for a velocity, or a position whose velocity is not trusted, because the rest of the vehicle then
-    contradicts the receiver's motion, as in a slowly growing spoof."""
-    memory, stamps = state.memory[source], state.source_stamps[source]
-    off = source_health.moved(memory, seen.innovation, seen.variance, seen.m, params.gates[seen.m])
-    if off or stamps[T_SAME_ERROR] == NEVER or t_ns - stamps[T_LAST] > BREAK_NS:
-        stamps[T_SAME_ERROR] = t_ns
-        return False
-    wait = params.gnss_reset_ns
-    companion = int(params.model_parameters[source, COMPANION])
-    returns = stamps[T_FUSED] == NEVER or stamps[T_SAME_ERROR] - stamps[T_BACK] <= OUTAGE_NS
-    if (returns and memory[LAST_RATIO] <= NEAR) or is_carried(state, params):
-        wait = params.gnss_return_ns
-    elif params.models[source] == GNSS_VELOCITY or (
-        companion >= 0 and not source_health.is_trusted(state.memory[companion])
-    ):
-        wait = SUSPECT * wait
-    return t_ns - stamps[T_SAME_ERROR] >= wait
+def _judge(
+    state: FilterState,
+    source: int,
+    whitened: Vector3,
+    m: int,
+    same: bool,
+    t_ns: int,
+    correlation: float,
+    params: Parameters,
+) -> None:
+    """Judge a source by its whitened innovation (m,). While rivals contend the others are not: nobody knows who is right.
+    A receiver that was found to lie comes back when its readings are as good as the main state expects."""
+    memory, stamps, model = state.memory[source], state.source_stamps[source], params.models[source]
+    gnss = model == GNSS_POSITION or model == GNSS_VELOCITY
+    if memory[EXCLUDED] != 0:
+        distance = 0.0
+        for a in range(m):
+            distance += whitened[a] * whitened[a]
+        if rivals.returns(distance, m, params):
+            memory[EXCLUDED] = 0.0
+            source_health.begin(memory)
+        return
+    if not gnss and state.stamps[ALIVE] > 0:
+        return
+    if source_health.is_due(stamps, t_ns, correlation):
+        source_health.judge(memory, stamps, whitened, m, same, t_ns)
+    elif gnss:
+        source_health.look(memory, whitened, m, same)
 
 
 @compiled
-def _reset(state: FilterState, source: int, seen: Observation, block: int) -> None:
-    """Put what a source observes where it says; `block` is the first of those error states. A barometer's is its own
-    offset: that is no jump."""
-    if block == HEIGHT_OFFSET_ERROR.start:
-        _reset_offset(state, seen)
+def _fuse_rivals(
+    state: FilterState, source: int, values: Vector, factor: float, weight: float, main: float, params: Parameters
+) -> None:
+    """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them."""
+    model, parameter = params.models[source], params.model_parameters[source]
+    seen = Observation(state.size)
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    for slot in range(rivals.RIVALS):
+        if state.bank[slot, 0] > 0:
+            rival = state.hypothesis(slot)
+            if not observe(rival, model, values, parameter, seen):
+                continue
+            project(rival, seen, across, spread)
+            share_noise(rival, seen, parameter)
+            for a in range(seen.m):
+                seen.variance[a] *= factor
+            if not rivals.uses(state, slot, source, params):
+                if slot == rivals.WHEELS:
+                    rivals.weigh(state, slot, rivals.unread(seen.variance, weight, seen.m, spread), main)
+                continue
+            own = rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
+            rivals.weigh(state, slot, own, main)
+            update_projected(rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread)
+
+
+@compiled
+def _suspect_state(state: FilterState, source: int, seen: Observation, params: Parameters) -> None:
+    """Where a receiver that is called a liar may be right all the same, as likely as the state is wrong, begin the rival that
+    is where it says."""
+    odds = state.bank[rivals.RECEIVER, 0]
+    if not odds > 0 or state.bank[rivals.RETURN, 0] > 0 or state.stamps[SUSPECT] != source:
         return
-    _reset_block(state, seen, block)
-    count_reset(state, ResetReason.SOURCE_RETURNED)
-    state.stamps[RESET_SOURCE] = source
+    wrong = rivals.wrong(state, is_carried(state, params))
+    odds *= wrong / (1 - wrong) / source_health.PRIOR_BIASED
+    if odds < rivals.BEGIN * (1 + state.bank[rivals.RECEIVER, 0]):
+        return
+    rivals.open_slot(state, rivals.RETURN, odds)
+    rival = state.hypothesis(rivals.RETURN)
+    _reset_block(rival, seen, int(params.model_parameters[source, RESETS]))
 
 
 @compiled

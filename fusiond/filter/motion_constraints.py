@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from fusiond.filter.measurement_update import update
+import numpy as np
+
+from fusiond.filter import rivals
+from fusiond.filter.measurement_update import project, update_projected
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
 from fusiond.filter.observations.model import Observation, with_rate_noise
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import is_trusted
 from fusiond.filter.state import (
+    ALIVE,
     CONSTRAINT_FUSED,
     CONSTRAINT_RATIO,
     CONSTRAINT_REJECTED,
@@ -162,10 +166,33 @@ def _apply(state: FilterState, which: int, params: Parameters, factor: float) ->
     if not observe_constraint(state, which, params, seen):
         return False
     with_rate_noise(state, seen)
-    ratio, fused = update(state, seen, params.gates[seen.m], factor)
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    project(state, seen, across, spread)
+    fits = rivals.likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
+    ratio, fused = update_projected(state, seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+    if state.stamps[ALIVE] > 0:
+        _apply_to_rivals(state, which, params, factor, fits)
+    rivals.watch_inertial(state, seen, factor, spread, fits)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     if fused:
         state.stamps[CONSTRAINT_FUSED.start + which] += 1
     else:
         state.stamps[CONSTRAINT_REJECTED.start + which] += 1
     return fused
+
+
+@compiled
+def _apply_to_rivals(state: FilterState, which: int, params: Parameters, factor: float, fits: float) -> None:
+    """Weigh the rivals by a constraint, whose likelihood under the main state is `fits`, and update them."""
+    seen = Observation(state.size)
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    for slot in range(rivals.RIVALS):
+        if state.bank[slot, 0] > 0:
+            rival = state.hypothesis(slot)
+            if observe_constraint(rival, which, params, seen):
+                with_rate_noise(rival, seen)
+                project(rival, seen, across, spread)
+                own = rivals.likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
+                rivals.weigh(state, slot, own, fits)
+                update_projected(rival, seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+    rivals.decide(state, params)

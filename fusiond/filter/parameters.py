@@ -51,8 +51,8 @@ class Parameters:
     snapshot_interval_ns: int
     imu_gap_ns: int
     restart_gap_ns: int
-    gnss_reset_ns: int
-    gnss_return_ns: int
+    spoof_cost: float  # loss for each metre by which a lying receiver pulls the state
+    dead_reckoning_cost: float  # loss for each metre by which dead reckoning drifts off a receiver that was right
     heading_variance: float  # rad^2: the spread of the headings at which the bank is collapsed
     constraint_interval_ns: int
     still_after_ns: int
@@ -101,8 +101,8 @@ def make_parameters(config: Config, stored: StoredState | None = None) -> Parame
         snapshot_interval_ns=nanoseconds(settings.snapshot_interval_s),
         imu_gap_ns=nanoseconds(settings.imu_gap_s),
         restart_gap_ns=nanoseconds(settings.restart_gap_s),
-        gnss_reset_ns=nanoseconds(settings.gnss_reset_s),
-        gnss_return_ns=nanoseconds(min(settings.gnss_return_s, settings.gnss_reset_s)),
+        spoof_cost=settings.spoof_cost,
+        dead_reckoning_cost=settings.dead_reckoning_cost,
         heading_variance=square(math.radians(settings.heading_spread_deg)),
         constraint_interval_ns=nanoseconds(motion.interval_s),
         still_after_ns=nanoseconds(motion.still_after_s),

@@ -16,13 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.filter.state import (
+    BEFORE,
     BELIEF,
     BIAS,
     BIAS_VARIANCE,
     BIASED,
+    EXCLUDED,
     FROZEN,
     INTERVAL,
-    LAST_INNOVATION,
     LAST_SUM,
     MEAN_NIS,
     NEVER,
@@ -38,6 +39,7 @@ from fusiond.maths.typed import Array, Matrix3, Stamps, Vector, Vector3, compile
 JUDGE_NS = 50_000_000  # samples closer than this share their error
 MEAN_STATUS_TIME = 20.0  # s: how long a source keeps its status
 PRIOR = (0.997, 0.001, 0.001, 0.001)  # nominal, noisy, biased, frozen: what it becomes then
+PRIOR_BIASED = PRIOR[2]
 OUTLIERS = 0.01  # share of readings that are off whatever the source is
 OUTLIER_VARIANCE = 100.0  # of such a reading, per axis, in units of S
 NOISY_VARIANCE = 16.0  # of a noisy source's innovation, likewise
@@ -48,7 +50,6 @@ MIN_BIAS = 3.0  # a smaller bias, in sigmas, is not called one
 SAME_IF_NOMINAL = 1 / 3  # chance that a good sensor repeats a reading to the bit
 SAME_IF_FAULTY = 1 / 20  # chance that a noisy or biased one does
 OTHER_IF_FROZEN = 1e-3  # chance that a frozen one does not
-MAX_STATE_VARIANCE = 4.0  # times the sensor's own: beyond, an innovation says more about the state than the sensor
 NOTED = 0.1  # a source that is noisy with at most this probability is taken as it is
 DISTRUST = 0.5  # a source that is biased or frozen with more than this probability is not fused
 ABSENT = 1e-3  # chance that a source that was heard a moment ago has gone
@@ -78,20 +79,9 @@ STATUSES = ("nominal", "noisy", "biased", "frozen", "absent")
 def begin(memory: Vector) -> None:
     """Know nothing of a source yet."""
     for i in range(4):
-        memory[NOMINAL + i] = PRIOR[i]
+        memory[NOMINAL + i] = memory[BEFORE.start + i] = PRIOR[i]
     memory[BIAS] = 0.0
     memory[BIAS_VARIANCE] = FIRST_BIAS_VARIANCE
-
-
-@compiled
-def observes_sensor(spread: Matrix3, variance: Vector3, m: int) -> bool:
-    """Whether an innovation says something about the sensor: H P H' (m, m) and R (m,), the one not far above the other. A
-    state that is uncertain, after an outage, is off in the same way at every look."""
-    total = own = 0.0
-    for a in range(m):
-        total += spread[a, a]
-        own += variance[a]
-    return total <= MAX_STATE_VARIANCE * own
 
 
 @compiled
@@ -120,18 +110,27 @@ def judge(memory: Vector, stamps: Stamps, whitened: Vector3, m: int, same: bool,
         elapsed = (t_ns - stamps[T_JUDGED]) * 1e-9
     stamps[T_JUDGED] = t_ns
     blurred = 1 - exp(-elapsed / MEAN_STATUS_TIME)
+    for i in range(4):
+        memory[BEFORE.start + i] = memory[NOMINAL + i] + blurred * (PRIOR[i] - memory[NOMINAL + i])
+    look(memory, whitened, m, same)
+    _follow_bias(memory, whitened, m)
+
+
+@compiled
+def look(memory: Vector, whitened: Vector3, m: int, same: bool) -> None:
+    """The probabilities after a look, from those before it. A reading that shares its error with the look before takes its
+    place: what both say counts once."""
     _renew_bias(memory, whitened, m)
     nominal, noisy, biased, frozen = likelihoods(memory, whitened, m, same)
-    memory[NOMINAL] = (memory[NOMINAL] + blurred * (PRIOR[0] - memory[NOMINAL])) * nominal
-    memory[NOISY] = (memory[NOISY] + blurred * (PRIOR[1] - memory[NOISY])) * noisy
-    memory[BIASED] = (memory[BIASED] + blurred * (PRIOR[2] - memory[BIASED])) * biased
-    memory[FROZEN] = (memory[FROZEN] + blurred * (PRIOR[3] - memory[FROZEN])) * frozen
+    memory[NOMINAL] = memory[BEFORE.start] * nominal
+    memory[NOISY] = memory[BEFORE.start + 1] * noisy
+    memory[BIASED] = memory[BEFORE.start + 2] * biased
+    memory[FROZEN] = memory[BEFORE.start + 3] * frozen
     total = 0.0
     for i in range(4):
         total += memory[NOMINAL + i]
     for i in range(4):
         memory[NOMINAL + i] = memory[NOMINAL + i] / total
-    _follow_bias(memory, whitened, m)
 
 
 @compiled
@@ -201,7 +200,34 @@ def _follow_bias(memory: Vector, whitened: Vector3, m: int) -> None:
 @compiled
 def is_trusted(memory: Vector) -> bool:
     """Whether a source is fused at all."""
-    return memory[BIASED] + memory[FROZEN] <= DISTRUST
+    return memory[EXCLUDED] == 0 and memory[BIASED] + memory[FROZEN] <= DISTRUST
+
+
+@compiled
+def is_used(memory: Vector, by_rivals: bool) -> bool:
+    """Whether a source is fused in the main state. Of a receiver, rival hypotheses decide whether it lies."""
+    return memory[EXCLUDED] == 0 and memory[FROZEN] + (0.0 if by_rivals else memory[BIASED]) <= DISTRUST
+
+
+@compiled
+def is_stuck(memory: Vector) -> bool:
+    """Whether a source repeats one reading."""
+    return memory[FROZEN] > DISTRUST
+
+
+@compiled
+def odds_of_bias(memory: Vector) -> float:
+    """Of a source being biased against its being nominal."""
+    return memory[BIASED] / memory[NOMINAL] if memory[NOMINAL] > 1e-12 else memory[BIASED] * 1e12
+
+
+@compiled
+def distrust(memory: Vector) -> None:
+    """Take a source as biased, until its readings say otherwise."""
+    for i in range(4):
+        memory[NOMINAL + i] = memory[BEFORE.start + i] = PRIOR[i]
+    memory[NOMINAL] = memory[BEFORE.start] = PRIOR[BIASED - NOMINAL]
+    memory[BIASED] = memory[BEFORE.start + BIASED - NOMINAL] = PRIOR[0]
 
 
 @compiled
@@ -257,23 +283,14 @@ def arrive(memory: Vector, stamps: Stamps, values: Vector, t_ns: int) -> bool:
     return same
 
 
-@compiled
-def moved(memory: Vector, innovation: Vector3, variance: Vector3, m: int, gate: float) -> bool:
-    """Whether the error of a rejected reading differs by more than noise from that of the one before; notes it."""
-    total = 0.0
-    for a in range(m):
-        step = innovation[a] - memory[LAST_INNOVATION.start + a]
-        total += step * step / (2 * variance[a])
-        memory[LAST_INNOVATION.start + a] = innovation[a]
-    return not total <= gate
-
-
 def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int) -> Belief:
     """The health of a source at `t_ns`, where the filter has run since `since_ns`.
 
     Absent (THEORY D2): with detection probability P_D, each expected reading that is missing has likelihood 1 - P_D.
     """
     kept = memory[BELIEF].tolist() if memory[BELIEF].any() else list(PRIOR)
+    if memory[EXCLUDED]:
+        kept = [0.0, 0.0, 1.0, 0.0]
     age = (t_ns - max(int(stamps[T_LAST]), since_ns)) * 1e-9
     expected = memory[INTERVAL] if memory[INTERVAL] > 0 else UNKNOWN_INTERVAL
     odds = ABSENT / (1 - ABSENT)

@@ -55,6 +55,7 @@ FURTHER_SCALES, FURTHER_SCALES_ERROR = _state(3)  # 1: the same of the second to
 ANTENNA_B, ANTENNA_ERROR = _state(3)  # m, what the antenna's lever arm is more than configured, b axes
 DELAYS, DELAYS_ERROR = _state(2)  # s, what the position's delay is more than configured, the velocity's more than that
 HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR = _state(1)  # m, how much too high the barometer reads
+INERTIAL_DOUBT = _nominal.one()  # 0..1: how much process noise a lie of the inertial sensor still adds; it fades
 NOMINAL_SIZE, WIDE_SIZE = _nominal.size, _error.size
 
 # Auxiliary numbers: places in FilterState.auxiliary
@@ -75,6 +76,8 @@ FIX_VARIANCE = _auxiliary.block(2)  # m^2, horizontal, vertical
 CONSTRAINT_RATIO = _auxiliary.block(3)  # last test ratios: non-holonomic, zero velocity, zero rotation
 RATE_VARIANCE = _auxiliary.one()  # (rad/s)^2, white noise of RATE_B, per axis
 SMOOTH_FORCE_B = _auxiliary.block(3)  # m/s^2, mean over the delays of receivers
+INERTIAL_ODDS = _auxiliary.one()  # that the inertial sensor lied a moment ago
+STATE_DOUBT = _auxiliary.one()  # probability that the position is wrong, since the inertial sensor lied
 AUXILIARY_SIZE = _auxiliary.size
 
 # Remembered of each source: columns of FilterState.memory
@@ -89,7 +92,8 @@ BIAS = _memory.block(3)  # whitened innovation that a biased source would have
 BIAS_VARIANCE = _memory.one()
 LAST_SUM = _memory.one()  # of the last reading's numbers: shows a repeated one
 INTERVAL = _memory.one()  # s, mean spacing of the events
-LAST_INNOVATION = _memory.block(3)  # of the last rejection
+BEFORE = _memory.block(4)  # the probabilities before the look that the newest readings share
+EXCLUDED = _memory.one()  # 1: a receiver that was found to lie
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
 MEMORY_SIZE = _memory.size
 
@@ -112,6 +116,8 @@ BLOWN = _stamps.one()  # count of restarts because the state was no longer finit
 RESET_REASON = _stamps.one()  # of the last jump: ResetReason
 RESET_SOURCE = _stamps.one()  # index of the source behind it, where there is one
 HOT_START = _stamps.one()  # result of the check of the stored state: Verdict
+ALIVE = _stamps.one()  # count of rival hypotheses in the bank (fusiond.filter.rivals)
+SUSPECT = _stamps.one()  # index of the position source of the receiver that a rival calls a liar
 STAMPS_SIZE = _stamps.size
 
 # And of each source: columns of FilterState.source_stamps
@@ -120,8 +126,6 @@ T_LAST = _source_stamps.one()  # ns, of its last event
 T_FUSED = _source_stamps.one()  # ns, of its last event fused
 T_REJECTED = _source_stamps.one()  # ns, of the first of an unbroken run of rejections; NEVER if there is none
 T_JUDGED = _source_stamps.one()  # ns, of the last look at its health
-T_SAME_ERROR = _source_stamps.one()  # ns, since when its rejected readings have the same error; NEVER if there is none
-T_BACK = _source_stamps.one()  # ns, since when it is heard again after an outage, or for the first time
 SOURCE_STAMPS_SIZE = _source_stamps.size
 
 EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
@@ -137,8 +141,9 @@ class ResetReason(IntEnum):
     DATA_GAP = 1  # no data for longer than filter.restart_gap_s: it aligns again
     HEADING_LOST = 2  # too long without the inertial sensor: it aligns again
     NOT_FINITE = 3  # a number was no longer finite: it aligns again
-    SOURCE_RETURNED = 4  # a source that was rejected all the time with the same error was taken as right
+    SOURCE_RETURNED = 4  # a receiver contradicted the state, and the state was likelier to be wrong
     HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored one
+    INERTIAL_LIED = 6  # the inertial sensor lied for a while, by all other sources: its part was taken back
 
 
 class Verdict(IntEnum):
@@ -207,13 +212,18 @@ class FilterState:
         return view
 
     def copy_from(self, other: FilterState) -> None:
-        """Become a snapshot of another state. The bank, most of the numbers, is all 0 but while a heading is chosen."""
-        if other.stamps[PHASE] == CHOOSING:
+        """Become a snapshot of another state. The bank, most of the numbers, is all 0 but while it
+        holds hypotheses."""
+        if other.fills_bank():
             self.bank[:] = other.bank
-        elif self.stamps[PHASE] == CHOOSING:
+        elif self.fills_bank():
             self.bank[:] = 0.0
         self.core[:] = other.core
         self.whole[:] = other.whole
+
+    def fills_bank(self) -> bool:
+        """Whether the bank holds hypotheses: of the heading, or rivals."""
+        return bool(self.stamps[PHASE] == CHOOSING or self.stamps[ALIVE] > 0)
 
     def clear(self) -> None:
         """Become empty."""

@@ -18,9 +18,11 @@ from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
 from fusiond.filter.parameters import Parameters
+from fusiond.filter.rivals import RIVALS, mix
 from fusiond.filter.rows import Outcome, Row, Rows
 from fusiond.filter.state import (
     ALIGNING,
+    ALIVE,
     ATTITUDE,
     BLOWN,
     CHOOSING,
@@ -72,7 +74,7 @@ def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> N
         guard(state)
     else:
         coasted = coasts(state, t_ns, params)
-        advance(state, t_ns, imu, params)
+        advance_all(state, t_ns, imu, params)
         if params.models[source] == IMU:
             keep_sample(state, row, params)
             constrain(state, params)
@@ -115,7 +117,7 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
     if stamps[PHASE] == ALIGNING:
         initial_alignment.gather(state, row, params)
     else:  # the IMU is back
-        advance(state, t_ns, imu, params)
+        advance_all(state, t_ns, imu, params)
         if yaw_variance(state) > square(LOST_HEADING) and _heard_gnss(state, params):
             count_reset(state, ResetReason.HEADING_LOST)
             initial_alignment.begin(state)
@@ -181,6 +183,20 @@ def yaw_variance(state: FilterState) -> float:
 
 
 @compiled
+def advance_all(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) -> None:
+    """Carry the state and its rivals to `t_ns`."""
+    begin = int(state.stamps[T])
+    advance(state, t_ns, imu, params)
+    if state.stamps[ALIVE] > 0:
+        for slot in range(RIVALS):
+            if state.bank[slot, 0] > 0:
+                state.stamps[T] = begin
+                rival = state.hypothesis(slot)
+                advance(rival, t_ns, imu, params)
+        state.stamps[T] = max(begin, t_ns)
+
+
+@compiled
 def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) -> None:
     """Carry the state to `t_ns`, on the IMU samples around it: the held one and `imu`, the next."""
     stamps, a = state.stamps, state.auxiliary
@@ -208,11 +224,27 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) 
 
 @compiled
 def predict(state: FilterState, t_ns: int, params: Parameters) -> None:
-    """Carry the state beyond the newest IMU sample, on that sample for at most `imu_gap`, then coasting. For publication
-    and then thrown away."""
+    """Carry the state beyond the newest IMU sample, on that sample for at most `imu_gap`, then coasting; where there are
+    rivals, make it the mixture's. For publication and then thrown away."""
+    stamps = state.stamps
+    begin = int(stamps[T])
+    if stamps[PHASE] != RUNNING:
+        return
+    _predict(state, t_ns, params)
+    if stamps[ALIVE] > 0:
+        for slot in range(RIVALS):
+            if state.bank[slot, 0] > 0:
+                stamps[T] = begin
+                rival = state.hypothesis(slot)
+                _predict(rival, t_ns, params)
+        mix(state)
+
+
+@compiled
+def _predict(state: FilterState, t_ns: int, params: Parameters) -> None:
     stamps, a = state.stamps, state.auxiliary
     begin = int(stamps[T])
-    if t_ns <= begin or stamps[PHASE] != RUNNING:
+    if t_ns <= begin:
         return
     until = max(begin, min(t_ns, int(stamps[T_IMU] + params.imu_gap_ns)))
     if not source_health.is_trusted(state.memory[params.imu_source]):

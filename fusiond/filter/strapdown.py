@@ -19,6 +19,7 @@ from fusiond.filter.state import (
     CALIBRATIONS,
     GYRO_BIAS,
     GYRO_BIAS_B,
+    INERTIAL_DOUBT,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
@@ -27,7 +28,7 @@ from fusiond.filter.state import (
     FilterState,
 )
 from fusiond.maths.linear import mirror
-from fusiond.maths.portable import square
+from fusiond.maths.portable import exp, square
 from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, times
 from fusiond.maths.typed import Covariance, Matrix3, Vector3, compiled
 from fusiond.maths.wgs84 import EARTH_RATE, MU, gravity_e
@@ -35,6 +36,10 @@ from fusiond.maths.wgs84 import EARTH_RATE, MU, gravity_e
 COAST_ACCEL = 2.0  # m/s^2/sqrt(Hz): what a vehicle may do while the inertial sensor is silent
 COAST_TURN = 0.3  # rad/s/sqrt(Hz), about the vertical: a car in a bend, where the velocity turns along
 COAST_TILT = 0.03  # rad/s/sqrt(Hz), about any axis: a car's body on its springs, and a road's slope
+DOUBT_TIME = 1.0  # s, over which the doubt in an inertial sensor that lied fades
+DOUBT_ACCEL = 1.0  # (m/s^2)^2/Hz that it adds to the noise while it is full: of the specific force
+DOUBT_GYRO = 0.01  # (rad/s)^2/Hz: of the angular rate
+DOUBT_BIAS = 0.01  # (rad/s)^2/s: of the gyro bias
 COAST_RATE = 0.5  # rad/s: the angular rate is not known any better then
 MAX_STEP = 0.05  # s: longer intervals are propagated in equal parts
 CORNER = slice(0, 9)  # position, velocity, attitude: the error states that the transition changes
@@ -85,7 +90,12 @@ def _step(state: FilterState, dt: float, force_b: Vector3, rate_b: Vector3, nois
     turned = quaternion_multiply(quaternion_exp(earth_turn), quaternion_multiply(x[QUATERNION_EB], quaternion_exp(turn)))
     x[QUATERNION_EB] = normalised(turned)
     _grow(state.covariance, dt, force_e, mat_eb, gradient)
-    _add_noise(state.covariance, dt, noise.accel, noise.gyro, noise)
+    doubt = x[INERTIAL_DOUBT]
+    _add_noise(state.covariance, dt, noise.accel + doubt * DOUBT_ACCEL, noise.gyro + doubt * DOUBT_GYRO, noise)
+    if doubt > 0:
+        for i in range(3):
+            state.covariance[GYRO_BIAS.start + i, GYRO_BIAS.start + i] += doubt * DOUBT_BIAS * dt
+        x[INERTIAL_DOUBT] = doubt * exp(-dt / DOUBT_TIME) if doubt > 1e-3 else 0.0
 
 
 @compiled

@@ -16,7 +16,7 @@ KERNEL = ROOT / "fusiond" / "filter" / "kernel"
 SIZES = {  # constants that the structs and the kernel's class need by name, and where they are
     "fusiond.filter.state": (
         "NOMINAL_SIZE", "AUXILIARY_SIZE", "MEMORY_SIZE", "STAMPS_SIZE", "SOURCE_STAMPS_SIZE", "HYPOTHESES", "CALIBRATIONS",
-        "WIDE_SIZE", "PHASE", "CHOOSING", "T",
+        "WIDE_SIZE", "PHASE", "CHOOSING", "ALIVE", "T",
     ),
     "fusiond.filter.observations.model": ("VALUES", "PARAMETERS"),
     "fusiond.filter.observations": ("IMU",),

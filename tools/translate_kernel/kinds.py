@@ -112,8 +112,6 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "imu_source": INT,
         "imu_gap_ns": INT,
         "restart_gap_ns": INT,
-        "gnss_reset_ns": INT,
-        "gnss_return_ns": INT,
         "constraint_interval_ns": INT,
         "still_after_ns": INT,
         "snapshot_interval_ns": INT,
@@ -125,6 +123,8 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "still_accel": FLOAT,
         "zero_velocity_factor": FLOAT,
         "heading_variance": FLOAT,
+        "spoof_cost": FLOAT,
+        "dead_reckoning_cost": FLOAT,
     },
 }
 COUNTED = {"models", "wheels", "velocities"}  # of Parameters: lists whose length is a field as well

@@ -682,17 +682,19 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double factor
     cdef int64_t a
     cdef double weight
-    cdef int64_t companion
+    cdef bint by_rivals
     cdef bint doubtful
+    cdef double before
     cdef double whitened[3]
-    cdef bint known
     cdef bint trusted
     cdef double noisy
+    cdef bint heard
+    cdef double fits
     cdef (double, bint) _t1
     cdef double ratio
     cdef bint fused
     cdef double _t2
-    cdef int64_t _t3
+    cdef double main
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
     model = params.models[source]
     values = row.values
@@ -716,72 +718,122 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
     if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
         stamps[1] = (<int64_t>-4611686018427387904)
-        stamps[5] = t_ns
         source_health_begin(memory)
-    companion = (<int64_t>(parameter[11]))
-    doubtful = motion_constraints_disputed(state, (source if (model == 1) else companion), params)
+    by_rivals = ((model == 0) or (model == 1))
+    doubtful = motion_constraints_disputed(state, (source if (model == 1) else (<int64_t>(parameter[11]))), params)
+    before = source_health_odds_of_bias(memory)
     if (not doubtful):
-        if source_health_is_due(stamps, t_ns, measurement_correlation_of(model, values, parameter)):
-            known = ((stamps[1] != (<int64_t>-4611686018427387904)) and source_health_observes_sensor(spread, learnt, m))
-            if (known and measurement_update_whiten(spread, seen.innovation, learnt, m, whitened)):
-                source_health_judge(memory, stamps, whitened, m, same, t_ns)
+        if measurement_update_whiten(spread, seen.innovation, learnt, m, whitened):
+            measurement__judge(state, source, whitened, m, same, t_ns, measurement_correlation_of(model, values, parameter), params)
         source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
-    trusted = (source_health_is_trusted(memory) and ((companion < 0) or source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))
+    trusted = source_health_is_used(memory, by_rivals)
     if ((model == 2) and trusted):
         trusted = (not motion_constraints_carried(state, memory[0], params))
     noisy = source_health_noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = (learnt[a] * noisy)
+    heard = ((not doubtful) and (not source_health_is_stuck(memory)) and (trusted or by_rivals))
+    fits = (rivals_likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0)
     _t1 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
     ratio = _t1[0]
     fused = _t1[1]
     _t2 = ratio
     row.ratio = _t2
     memory[2] = _t2
-    if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, params)):
-        measurement__reset(state, source, &seen, (<int64_t>(parameter[13])))
+    if ((state.stamps[21] > 0) and heard):
+        main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
+        measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, params)
+    if (by_rivals and (not doubtful)):
+        rivals_suspect_receiver(state, source, before, params)
+        if ((model == 0) and (not fused)):
+            measurement__suspect_state(state, source, &seen, params)
+    if (trusted and heard):
+        rivals_watch_inertial(state, &seen, weight, spread, fits)
+    if (state.stamps[21] > 0):
+        rivals_decide(state, params)
+    if ((not fused) and ((<int64_t>(parameter[13])) == 26) and (memory[6] > 0.5)):
+        measurement__reset_offset(state, &seen)
         source_health_begin(memory)
         fused = True
     if fused:
-        _t3 = (<int64_t>-4611686018427387904)
-        stamps[2] = _t3
-        stamps[4] = _t3
+        stamps[2] = (<int64_t>-4611686018427387904)
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
+            state.auxiliary[40] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     return fused
 
-cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Parameters* params) noexcept nogil:
+cdef void measurement__judge(State* state, int64_t source, double* whitened, int64_t m, bint same, int64_t t_ns, double correlation, Parameters* params) noexcept nogil:
     cdef double* memory
     cdef int64_t* stamps
-    cdef bint off
-    cdef int64_t wait
-    cdef int64_t companion
-    cdef bint returns
+    cdef int64_t model
+    cdef bint gnss
+    cdef double distance
+    cdef int64_t a
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
-    off = source_health_moved(memory, seen.innovation, seen.variance, seen.m, params.gates[seen.m])
-    if (off or (stamps[4] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>5000000000))):
-        stamps[4] = t_ns
-        return False
-    wait = params.gnss_reset_ns
-    companion = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 11]))
-    returns = ((stamps[1] == (<int64_t>-4611686018427387904)) or ((stamps[4] - stamps[5]) <= (<int64_t>10000000000)))
-    if ((returns and (memory[2] <= 9.0)) or motion_constraints_is_carried(state, params)):
-        wait = params.gnss_return_ns
-    elif ((params.models[source] == 1) or ((companion >= 0) and (not source_health_is_trusted(state.memory + (companion) * MEMORY_SIZE)))):
-        wait = (6 * wait)
-    return ((t_ns - stamps[4]) >= wait)
-
-cdef void measurement__reset(State* state, int64_t source, Observation* seen, int64_t block) noexcept nogil:
-    if (block == 26):
-        measurement__reset_offset(state, seen)
+    model = params.models[source]
+    gnss = ((model == 0) or (model == 1))
+    if (memory[18] != 0):
+        distance = 0.0
+        for a in range(m):
+            distance += (whitened[a] * whitened[a])
+        if rivals_returns(distance, m, params):
+            memory[18] = 0.0
+            source_health_begin(memory)
         return
-    measurement__reset_block(state, seen, block)
-    state_count_reset(state, 4)
-    state.stamps[19] = source
+    if ((not gnss) and (state.stamps[21] > 0)):
+        return
+    if source_health_is_due(stamps, t_ns, correlation):
+        source_health_judge(memory, stamps, whitened, m, same, t_ns)
+    elif gnss:
+        source_health_look(memory, whitened, m, same)
+
+cdef void measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, Parameters* params) noexcept nogil:
+    cdef int64_t model
+    cdef double* parameter
+    cdef Observation seen
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    cdef int64_t slot
+    cdef State rival
+    cdef int64_t a
+    cdef double own
+    model = params.models[source]
+    parameter = params.model_parameters + (source) * PARAMETERS
+    for slot in range(4):
+        if (state.bank[(slot) * BLOCK + 0] > 0):
+            rival = hypothesis_of(state, slot)
+            if (not observations_observe(&rival, model, values, parameter, &seen)):
+                continue
+            measurement_update_project(&rival, &seen, across, spread)
+            measurement_share_noise(&rival, &seen, parameter)
+            for a in range(seen.m):
+                seen.variance[a] *= factor
+            if (not rivals_uses(state, slot, source, params)):
+                if (slot == 3):
+                    rivals_weigh(state, slot, rivals_unread(seen.variance, weight, seen.m, spread), main)
+                continue
+            own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
+            rivals_weigh(state, slot, own, main)
+            measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
+
+cdef void measurement__suspect_state(State* state, int64_t source, Observation* seen, Parameters* params) noexcept nogil:
+    cdef double odds
+    cdef double wrong
+    cdef State rival
+    odds = state.bank[(1) * BLOCK + 0]
+    if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[22] != source)):
+        return
+    wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
+    odds *= ((wrong / (1 - wrong)) / 0.001)
+    if (odds < (0.01 * (1 + state.bank[(1) * BLOCK + 0]))):
+        return
+    rivals_open_slot(state, 2, odds)
+    rival = hypothesis_of(state, 2)
+    measurement__reset_block(&rival, seen, (<int64_t>(params.model_parameters[(source) * PARAMETERS + 13])))
 
 cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
     cdef double* x
@@ -1260,21 +1312,47 @@ cdef bint motion_constraints_observe_constraint(State* state, int64_t which, Par
 
 cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* params, double factor) noexcept nogil:
     cdef Observation seen
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    cdef double fits
     cdef (double, bint) _t1
     cdef double ratio
     cdef bint fused
     if (not motion_constraints_observe_constraint(state, which, params, &seen)):
         return False
     model_with_rate_noise(state, &seen)
-    _t1 = measurement_update_update(state, &seen, params.gates[seen.m], factor, True, 0.0)
+    measurement_update_project(state, &seen, across, spread)
+    fits = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
+    _t1 = measurement_update_update_projected(state, &seen, params.gates[seen.m], factor, True, 0.0, across, spread)
     ratio = _t1[0]
     fused = _t1[1]
+    if (state.stamps[21] > 0):
+        motion_constraints__apply_to_rivals(state, which, params, factor, fits)
+    rivals_watch_inertial(state, &seen, factor, spread, fits)
     state.auxiliary[(32 + which)] = ratio
     if fused:
         state.stamps[(11 + which)] += 1
     else:
         state.stamps[(14 + which)] += 1
     return fused
+
+cdef void motion_constraints__apply_to_rivals(State* state, int64_t which, Parameters* params, double factor, double fits) noexcept nogil:
+    cdef Observation seen
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    cdef int64_t slot
+    cdef State rival
+    cdef double own
+    for slot in range(4):
+        if (state.bank[(slot) * BLOCK + 0] > 0):
+            rival = hypothesis_of(state, slot)
+            if motion_constraints_observe_constraint(&rival, which, params, &seen):
+                model_with_rate_noise(&rival, &seen)
+                measurement_update_project(&rival, &seen, across, spread)
+                own = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
+                rivals_weigh(state, slot, own, fits)
+                measurement_update_update_projected(&rival, &seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+    rivals_decide(state, params)
 
 # ---------------- fusiond.filter.north_east_down
 
@@ -1798,29 +1876,323 @@ cdef bint zero_velocity_observe(State* state, double* row, double* parameter, Ob
         seen.variance[i] = parameter[0]
     return True
 
+# ---------------- fusiond.filter.rivals
+
+cdef double rivals_likelihood(double* innovation, double* variance, double factor, int64_t m, double* spread) noexcept nogil:
+    cdef double lower[3 * 3]
+    cdef double widened[3]
+    cdef double whitened[3]
+    cdef int64_t a
+    cdef double distance
+    cdef double size
+    cdef double outlier
+    cdef int64_t _a
+    for a in range(m):
+        widened[a] = (factor * variance[a])
+    if ((not measurement_update_cholesky(spread, widened, 1.0, m, lower)) or (not measurement_update_whiten(spread, innovation, widened, m, whitened))):
+        return 0.0
+    distance, size = 0.0, 1.0
+    for a in range(m):
+        distance += (whitened[a] * whitened[a])
+        size *= lower[(a) * 3 + a]
+    outlier = (0.01 * portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / (2 * 100.0))))
+    for _a in range(m):
+        outlier /= 10.0
+    return ((((1 - 0.01) * portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / 2))) + outlier) / size)
+
+cdef double rivals_unread(double* variance, double factor, int64_t m, double* spread) noexcept nogil:
+    cdef double lower[3 * 3]
+    cdef double widened[3]
+    cdef double expected
+    cdef double size
+    cdef int64_t a
+    expected, size = 0.0, 1.0
+    for a in range(m):
+        widened[a] = (factor * variance[a])
+        expected += ((spread[(a) * 3 + a] + variance[a]) / (spread[(a) * 3 + a] + widened[a]))
+    if (not measurement_update_cholesky(spread, widened, 1.0, m, lower)):
+        return 0.0
+    for a in range(m):
+        size *= lower[(a) * 3 + a]
+    return (portable_exp(((-expected) / 2)) / size)
+
+cdef double rivals_lie_variance(int64_t k) noexcept nogil:
+    if (3 <= k < 6):
+        return (1.0 * 1.0)
+    if (6 <= k < 9):
+        return (0.1 * 0.1)
+    if (9 <= k < 12):
+        return (0.1 * 0.1)
+    if (12 <= k < 15):
+        return (1.0 * 1.0)
+    return 0.0
+
+cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, double* spread, double fits) noexcept nogil:
+    cdef double* a
+    cdef double widened[3 * 3]
+    cdef int64_t i
+    cdef int64_t j
+    cdef int64_t k
+    cdef double lied
+    cdef double _t1
+    cdef double _t2
+    cdef double _t3
+    a = state.auxiliary
+    if ((state.bank[(0) * BLOCK + 0] > 0) or (state.nominal[28] > 0.3) or (not (fits > 0))):
+        return
+    for i in range(seen.m):
+        for j in range(seen.m):
+            widened[(i) * 3 + j] = spread[(i) * 3 + j]
+            for k in range(3, 15):
+                widened[(i) * 3 + j] += ((seen.jacobian[(i) * n + k] * rivals_lie_variance(k)) * seen.jacobian[(j) * n + k])
+    lied = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, widened)
+    _t1 = a[39]
+    _t2 = 1e-06
+    _t3 = ((_t2 if _t2 > _t1 else _t1) * (lied / fits))
+    a[39] = (1000000000000.0 if 1000000000000.0 < _t3 else _t3)
+    if (a[39] >= 0.01):
+        rivals__suspect_motion(state, 0.01)
+
+cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
+    cdef State rival
+    cdef int64_t k
+    if (state.bank[(0) * BLOCK + 0] == 0):
+        rivals_open_slot(state, 0, odds)
+        rival = hypothesis_of(state, 0)
+        rival.nominal[28] = 1.0
+        for k in range(3, 15):
+            rival.covariance[(k) * n + k] += rivals_lie_variance(k)
+    if (state.bank[(3) * BLOCK + 0] == 0):
+        rivals_open_slot(state, 3, odds)
+    state.auxiliary[39] = 1e-06
+
+cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nogil:
+    cdef State rival
+    cdef int _i
+    cdef int64_t k
+    if (state.bank[(slot) * BLOCK + 0] == 0):
+        state.stamps[21] += 1
+    state.bank[(slot) * BLOCK + 0] = odds
+    rival = hypothesis_of(state, slot)
+    for _i in range(NOMINAL_SIZE):
+        rival.nominal[_i] = state.nominal[_i]
+    for k in range(n):
+        for _i in range(n):
+            (rival.covariance + (k) * n)[_i] = (state.covariance + (k) * n)[_i]
+
+cdef void rivals_close_slot(State* state, int64_t slot) noexcept nogil:
+    cdef int _i
+    if (state.bank[(slot) * BLOCK + 0] > 0):
+        state.stamps[21] -= 1
+    for _i in range(BLOCK):
+        (state.bank + (slot) * BLOCK)[_i] = 0.0
+
+cdef bint rivals_uses(State* state, int64_t slot, int64_t source, Parameters* params) noexcept nogil:
+    cdef int64_t suspect
+    if ((slot == 3) and (params.models[source] == 2)):
+        return False
+    suspect = (<int64_t>(state.stamps[22]))
+    if ((suspect >= 0) and ((source == suspect) or (source == (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))))):
+        if (slot == 1):
+            return False
+        if (slot == 2):
+            return True
+    return (state.memory[(source) * MEMORY_SIZE + 18] == 0)
+
+cdef void rivals_weigh(State* state, int64_t slot, double own, double main) noexcept nogil:
+    cdef double _t1
+    if ((own > 0) and (main > 0)):
+        _t1 = (state.bank[(slot) * BLOCK + 0] * (own / main))
+        state.bank[(slot) * BLOCK + 0] = (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
+
+cdef void rivals_suspect_receiver(State* state, int64_t source, double before, Parameters* params) noexcept nogil:
+    cdef double odds
+    cdef int64_t suspect
+    cdef double _t1
+    odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
+    suspect = rivals_position_of(source, params)
+    if (state.bank[(1) * BLOCK + 0] > 0):
+        if ((state.stamps[22] == suspect) and (before > 0)):
+            _t1 = (state.bank[(1) * BLOCK + 0] * (odds / before))
+            state.bank[(1) * BLOCK + 0] = (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
+        return
+    if ((odds < 0.01) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
+        return
+    state.stamps[22] = suspect
+    rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
+    rivals__suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) * 0.01))
+
+cdef bint rivals_returns(double distance, int64_t m, Parameters* params) noexcept nogil:
+    cdef double odds
+    cdef int64_t _a
+    odds = (0.02 * portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / 2)))
+    for _a in range(m):
+        odds /= 0.025066282746310002
+    return ((odds * params.dead_reckoning_cost) >= params.spoof_cost)
+
+cdef int64_t rivals_position_of(int64_t source, Parameters* params) noexcept nogil:
+    cdef int64_t i
+    if (params.models[source] == 0):
+        return source
+    for i in range(params.models_count):
+        if ((params.models[i] == 0) and ((<int64_t>(params.model_parameters[(i) * PARAMETERS + 11])) == source)):
+            return i
+    return (-1)
+
+cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
+    cdef double since
+    cdef double _t1
+    if carried:
+        return 0.9
+    since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
+    _t1 = (state.auxiliary[40] + (0.0001 * (0.0 if 0.0 > since else since)))
+    return (0.9 if 0.9 < _t1 else _t1)
+
+cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
+    cdef double total
+    cdef int64_t slot
+    cdef State hypothesis
+    cdef State inertial
+    cdef double odds
+    cdef double needed
+    cdef double against
+    cdef State rival
+    cdef double apart
+    cdef double blurred
+    cdef int64_t i
+    total = 1.0
+    for slot in range(4):
+        if (state.bank[(slot) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, slot)
+            if (not state_is_finite(&hypothesis)):
+                rivals_close_slot(state, slot)
+            total += state.bank[(slot) * BLOCK + 0]
+    for slot in range(4):
+        if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 * total)):
+            rivals_close_slot(state, slot)
+    inertial = hypothesis_of(state, 0)
+    if ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[28] < 0.05)):
+        if (state.bank[(0) * BLOCK + 0] < 1):
+            rivals_close_slot(state, 0)
+        if (0 < state.bank[(3) * BLOCK + 0] < 1):
+            rivals_close_slot(state, 3)
+    for slot in range(4):
+        odds = state.bank[(slot) * BLOCK + 0]
+        if (odds > 0):
+            needed = 1.0
+            against = (total - odds)
+            if (slot == 1):
+                rival = hypothesis_of(state, 1)
+                apart, blurred = 1e-09, 0.0
+                for i in range(3):
+                    apart += portable_square((rival.nominal[(0 + i)] - state.nominal[(0 + i)]))
+                    blurred += rival.covariance[((0 + i)) * n + (0 + i)]
+                needed = ((params.dead_reckoning_cost / params.spoof_cost) * sqrt((blurred / apart)))
+            elif (slot == 2):
+                needed = (params.spoof_cost / params.dead_reckoning_cost)
+            if (odds >= (needed * against)):
+                rivals__lead(state, slot, params)
+                return
+
+cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept nogil:
+    cdef State rival
+    cdef int64_t suspect
+    cdef int _i
+    cdef int64_t k
+    cdef int64_t other
+    cdef int64_t source
+    rival = hypothesis_of(state, slot)
+    suspect = (<int64_t>(state.stamps[22]))
+    for _i in range(NOMINAL_SIZE):
+        state.nominal[_i] = rival.nominal[_i]
+    for k in range(n):
+        for _i in range(n):
+            (state.covariance + (k) * n)[_i] = (rival.covariance + (k) * n)[_i]
+    for other in range(4):
+        rivals_close_slot(state, other)
+    if (slot == 0):
+        state.auxiliary[40] = 0.5
+        state_count_reset(state, 6)
+        for source in range(state.sources):
+            state.memory[(source) * MEMORY_SIZE + 18] = 0.0
+            source_health_begin(state.memory + (source) * MEMORY_SIZE)
+    elif (slot == 3):
+        for source in range(state.sources):
+            if (params.models[source] == 2):
+                source_health_distrust(state.memory + (source) * MEMORY_SIZE)
+    elif (slot == 1):
+        rivals_exclude(state, suspect, 1.0, params)
+    else:
+        rivals_exclude(state, suspect, 0.0, params)
+        state_count_reset(state, 4)
+        state.stamps[19] = suspect
+
+cdef void rivals_exclude(State* state, int64_t suspect, double excluded, Parameters* params) noexcept nogil:
+    cdef int64_t companion
+    companion = (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))
+    state.memory[(suspect) * MEMORY_SIZE + 18] = excluded
+    source_health_begin(state.memory + (suspect) * MEMORY_SIZE)
+    if (companion >= 0):
+        state.memory[(companion) * MEMORY_SIZE + 18] = excluded
+        source_health_begin(state.memory + (companion) * MEMORY_SIZE)
+
+cdef void rivals_mix(State* state) noexcept nogil:
+    cdef double total
+    cdef int64_t slot
+    cdef double errors[4 * n]
+    cdef double mean[n]
+    cdef State rival
+    cdef double _t1[n]
+    cdef int _i
+    cdef double* p
+    cdef int64_t j
+    cdef double _t2
+    cdef double weight
+    cdef double _t3
+    cdef double _t4
+    total = 1.0
+    for slot in range(4):
+        total += state.bank[(slot) * BLOCK + 0]
+    memset(errors, 0, 4 * n * sizeof(double))
+    memset(mean, 0, n * sizeof(double))
+    for slot in range(4):
+        if (state.bank[(slot) * BLOCK + 0] > 0):
+            rival = hypothesis_of(state, slot)
+            measurement_update_difference(&rival, state, _t1)
+            for _i in range(n):
+                (errors + (slot) * n)[_i] = _t1[_i]
+            axpy(mean, (state.bank[(slot) * BLOCK + 0] / total), errors + (slot) * n)
+    p = state.covariance
+    for j in range(n):
+        _t2 = (1 / total)
+        for _i in range(n):
+            (p + (j) * n)[_i] *= _t2
+        axpy(p + (j) * n, (mean[j] / total), mean)
+    for slot in range(4):
+        if (state.bank[(slot) * BLOCK + 0] > 0):
+            weight = (state.bank[(slot) * BLOCK + 0] / total)
+            rival = hypothesis_of(state, slot)
+            for j in range(n):
+                _t3 = (errors[(slot) * n + j] - mean[j])
+                _t4 = (errors[(slot) * n + j] - mean[j])
+                for _i in range(n):
+                    (p + (j) * n)[_i] += (weight * ((rival.covariance + (j) * n)[_i] + (_t4 * ((errors + (slot) * n)[_i] - mean[_i]))))
+    linear_mirror(p)
+    measurement_update_inject(state, mean)
+
 # ---------------- fusiond.filter.source_health
 
 cdef void source_health_begin(double* memory) noexcept nogil:
     cdef int64_t i
+    cdef double _t1
     cdef int _i
     for i in range(4):
-        memory[(4 + i)] = PRIOR[i]
+        _t1 = PRIOR[i]
+        memory[(4 + i)] = _t1
+        memory[(14 + i)] = _t1
     for _i in range(3):
         (memory + 8)[_i] = 0.0
     memory[11] = 100.0
-
-cdef bint source_health_observes_sensor(double* spread, double* variance, int64_t m) noexcept nogil:
-    cdef double _t1
-    cdef double total
-    cdef double own
-    cdef int64_t a
-    _t1 = 0.0
-    total = _t1
-    own = _t1
-    for a in range(m):
-        total += spread[(a) * 3 + a]
-        own += variance[a]
-    return (total <= (4.0 * own))
 
 cdef void source_health_judge_repetition(double* memory, int64_t* stamps, bint same, int64_t t_ns) noexcept nogil:
     cdef double nothing[3]
@@ -1836,12 +2208,6 @@ cdef bint source_health_is_due(int64_t* stamps, int64_t t_ns, double correlation
 cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened, int64_t m, bint same, int64_t t_ns) noexcept nogil:
     cdef double elapsed
     cdef double blurred
-    cdef (double, double, double, double) _t1
-    cdef double nominal
-    cdef double noisy
-    cdef double biased
-    cdef double frozen
-    cdef double total
     cdef int64_t i
     if ((((memory[4] + memory[5]) + memory[6]) + memory[7]) == 0):
         source_health_begin(memory)
@@ -1850,22 +2216,34 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
         elapsed = ((t_ns - stamps[3]) * 1e-09)
     stamps[3] = t_ns
     blurred = (1 - portable_exp(((-elapsed) / 20.0)))
+    for i in range(4):
+        memory[(14 + i)] = (memory[(4 + i)] + (blurred * (PRIOR[i] - memory[(4 + i)])))
+    source_health_look(memory, whitened, m, same)
+    source_health__follow_bias(memory, whitened, m)
+
+cdef void source_health_look(double* memory, double* whitened, int64_t m, bint same) noexcept nogil:
+    cdef (double, double, double, double) _t1
+    cdef double nominal
+    cdef double noisy
+    cdef double biased
+    cdef double frozen
+    cdef double total
+    cdef int64_t i
     source_health__renew_bias(memory, whitened, m)
     _t1 = source_health_likelihoods(memory, whitened, m, same)
     nominal = _t1[0]
     noisy = _t1[1]
     biased = _t1[2]
     frozen = _t1[3]
-    memory[4] = ((memory[4] + (blurred * (0.997 - memory[4]))) * nominal)
-    memory[5] = ((memory[5] + (blurred * (0.001 - memory[5]))) * noisy)
-    memory[6] = ((memory[6] + (blurred * (0.001 - memory[6]))) * biased)
-    memory[7] = ((memory[7] + (blurred * (0.001 - memory[7]))) * frozen)
+    memory[4] = (memory[14] * nominal)
+    memory[5] = (memory[(14 + 1)] * noisy)
+    memory[6] = (memory[(14 + 2)] * biased)
+    memory[7] = (memory[(14 + 3)] * frozen)
     total = 0.0
     for i in range(4):
         total += memory[(4 + i)]
     for i in range(4):
         memory[(4 + i)] = (memory[(4 + i)] / total)
-    source_health__follow_bias(memory, whitened, m)
 
 cdef (double, double, double, double) source_health_likelihoods(double* memory, double* whitened, int64_t m, bint same) noexcept nogil:
     cdef double _t1
@@ -1946,7 +2324,32 @@ cdef void source_health__follow_bias(double* memory, double* whitened, int64_t m
     memory[11] = ((1 - gain) * variance)
 
 cdef bint source_health_is_trusted(double* memory) noexcept nogil:
-    return ((memory[6] + memory[7]) <= 0.5)
+    return ((memory[18] == 0) and ((memory[6] + memory[7]) <= 0.5))
+
+cdef bint source_health_is_used(double* memory, bint by_rivals) noexcept nogil:
+    return ((memory[18] == 0) and ((memory[7] + (0.0 if by_rivals else memory[6])) <= 0.5))
+
+cdef bint source_health_is_stuck(double* memory) noexcept nogil:
+    return (memory[7] > 0.5)
+
+cdef double source_health_odds_of_bias(double* memory) noexcept nogil:
+    return ((memory[6] / memory[4]) if (memory[4] > 1e-12) else (memory[6] * 1000000000000.0))
+
+cdef void source_health_distrust(double* memory) noexcept nogil:
+    cdef int64_t i
+    cdef double _t1
+    cdef double _t2
+    cdef double _t3
+    for i in range(4):
+        _t1 = PRIOR[i]
+        memory[(4 + i)] = _t1
+        memory[(14 + i)] = _t1
+    _t2 = PRIOR[(6 - 4)]
+    memory[4] = _t2
+    memory[14] = _t2
+    _t3 = 0.997
+    memory[6] = _t3
+    memory[((14 + 6) - 4)] = _t3
 
 cdef double source_health_noise_factor(double* memory, double lowest, double highest) noexcept nogil:
     cdef double beyond
@@ -1983,7 +2386,7 @@ cdef void source_health_learn(double* memory, double* innovation, double* varian
         _t2 = (25.0 * expected)
         found += ((_t2 if _t2 < square else square) - spread[(a) * 3 + a])
         configured += variance[a]
-    memory[17] += ((elapsed / (10.0 + elapsed)) * ((nis / m) - memory[17]))
+    memory[19] += ((elapsed / (10.0 + elapsed)) * ((nis / m) - memory[19]))
     if (configured > 0):
         memory[3] += ((elapsed / (30.0 + elapsed)) * (((found / configured) - 1) - memory[3]))
 
@@ -2005,17 +2408,6 @@ cdef bint source_health_arrive(double* memory, int64_t* stamps, double* values, 
         share = (0.05 if (memory[13] > 0) else 1.0)
         memory[13] += (share * ((10.0 if 10.0 < elapsed else elapsed) - memory[13]))
     return same
-
-cdef bint source_health_moved(double* memory, double* innovation, double* variance, int64_t m, double gate) noexcept nogil:
-    cdef double total
-    cdef int64_t a
-    cdef double step
-    total = 0.0
-    for a in range(m):
-        step = (innovation[a] - memory[(14 + a)])
-        total += ((step * step) / (2 * variance[a]))
-        memory[(14 + a)] = innovation[a]
-    return (not (total <= gate))
 
 # ---------------- fusiond.filter.state
 
@@ -2054,7 +2446,7 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
         step_guard(state)
     else:
         coasted = step_coasts(state, t_ns, params)
-        step_advance(state, t_ns, imu, params)
+        step_advance_all(state, t_ns, imu, params)
         if (params.models[source] == -1):
             step_keep_sample(state, row, params)
             motion_constraints_constrain(state, params)
@@ -2130,6 +2522,20 @@ cdef double step_yaw_variance(State* state) noexcept nogil:
             total += ((r[i] * state.covariance[((phi + i)) * n + (phi + j)]) * r[j])
     return (total / (((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2])))
 
+cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* params) noexcept nogil:
+    cdef int64_t begin
+    cdef int64_t slot
+    cdef State rival
+    begin = (<int64_t>(state.stamps[0]))
+    step_advance(state, t_ns, imu, params)
+    if (state.stamps[21] > 0):
+        for slot in range(4):
+            if (state.bank[(slot) * BLOCK + 0] > 0):
+                state.stamps[0] = begin
+                rival = hypothesis_of(state, slot)
+                step_advance(&rival, t_ns, imu, params)
+        state.stamps[0] = (t_ns if t_ns > begin else begin)
+
 cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
     cdef double* a
@@ -2179,6 +2585,24 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
 
 cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
+    cdef int64_t begin
+    cdef int64_t slot
+    cdef State rival
+    stamps = state.stamps
+    begin = (<int64_t>(stamps[0]))
+    if (stamps[9] != 2):
+        return
+    step__predict(state, t_ns, params)
+    if (stamps[21] > 0):
+        for slot in range(4):
+            if (state.bank[(slot) * BLOCK + 0] > 0):
+                stamps[0] = begin
+                rival = hypothesis_of(state, slot)
+                step__predict(&rival, t_ns, params)
+        rivals_mix(state)
+
+cdef void step__predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
+    cdef int64_t* stamps
     cdef double* a
     cdef int64_t begin
     cdef int64_t _t1
@@ -2187,7 +2611,7 @@ cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept 
     stamps = state.stamps
     a = state.auxiliary
     begin = (<int64_t>(stamps[0]))
-    if ((t_ns <= begin) or (stamps[9] != 2)):
+    if (t_ns <= begin):
         return
     _t1 = (<int64_t>((stamps[1] + params.imu_gap_ns)))
     _t2 = (_t1 if _t1 < t_ns else t_ns)
@@ -2365,6 +2789,8 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     cdef double _t10[4]
     cdef double _t11[4]
     cdef double _t12[4]
+    cdef double doubt
+    cdef int64_t i
     x = state.nominal
     for _i in range(3):
         force[_i] = (force_b[_i] - (x + 13)[_i])
@@ -2410,7 +2836,12 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     for _i in range(4):
         (x + 6)[_i] = _t12[_i]
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
-    strapdown__add_noise(state.covariance, dt, noise.accel, noise.gyro, noise)
+    doubt = x[28]
+    strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 1.0)), (noise.gyro + (doubt * 0.01)), noise)
+    if (doubt > 0):
+        for i in range(3):
+            state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.01) * dt)
+        x[28] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
 
 cdef void strapdown_gravity_gradient(double* position_e, double* out) noexcept nogil:
     cdef double r2

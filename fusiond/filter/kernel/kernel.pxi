@@ -135,9 +135,9 @@ cdef class Kernel:
         """Kernel.restore of the interpreter"""
         cdef size_t bank_bytes = HYPOTHESES * BLOCK * sizeof(double)
         memcpy(&self.head_numbers[0], &self.kept_numbers[kept - 1, 0], self.core_size * sizeof(double))
-        if self.kept_whole[kept - 1, PHASE] == CHOOSING:
+        if self.kept_whole[kept - 1, PHASE] == CHOOSING or self.kept_whole[kept - 1, ALIVE] > 0:
             memcpy(&self.head_numbers[self.core_size], &self.kept_numbers[kept - 1, self.core_size], bank_bytes)
-        elif self.head_whole[PHASE] == CHOOSING:
+        elif self.head_whole[PHASE] == CHOOSING or self.head_whole[ALIVE] > 0:
             memset(&self.head_numbers[self.core_size], 0, bank_bytes)
         memcpy(&self.head_whole[0], &self.kept_whole[kept - 1, 0], self.head_whole.shape[0] * sizeof(int64_t))
 
@@ -182,7 +182,7 @@ cdef class Kernel:
             return kept
         if not step_is_final(&self.state, source, &self.params):
             return kept
-        if self.state.stamps[PHASE] == CHOOSING:
+        if self.state.stamps[PHASE] == CHOOSING or self.state.stamps[ALIVE] > 0:
             size = self.numbers_size
         memcpy(&self.kept_numbers[kept, 0], self.state.nominal, size * sizeof(double))
         memcpy(&self.kept_whole[kept, 0], self.state.stamps, self.head_whole.shape[0] * sizeof(int64_t))

@@ -1,16 +1,17 @@
 # Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 cdef enum:
-    NOMINAL_SIZE = 28
-    AUXILIARY_SIZE = 39
-    MEMORY_SIZE = 18
-    STAMPS_SIZE = 21
-    SOURCE_STAMPS_SIZE = 6
+    NOMINAL_SIZE = 29
+    AUXILIARY_SIZE = 41
+    MEMORY_SIZE = 20
+    STAMPS_SIZE = 23
+    SOURCE_STAMPS_SIZE = 4
     HYPOTHESES = 13
     CALIBRATIONS = 15
     WIDE_SIZE = 27
     PHASE = 9
     CHOOSING = 3
+    ALIVE = 21
     T = 0
     VALUES = 8
     PARAMETERS = 16
@@ -67,8 +68,6 @@ cdef struct Parameters:
     int64_t imu_source
     int64_t imu_gap_ns
     int64_t restart_gap_ns
-    int64_t gnss_reset_ns
-    int64_t gnss_return_ns
     int64_t constraint_interval_ns
     int64_t still_after_ns
     int64_t snapshot_interval_ns
@@ -80,6 +79,8 @@ cdef struct Parameters:
     double still_accel
     double zero_velocity_factor
     double heading_variance
+    double spoof_cost
+    double dead_reckoning_cost
 
 
 cdef int load_scalars(Parameters* loaded, params) except -1:
@@ -87,8 +88,6 @@ cdef int load_scalars(Parameters* loaded, params) except -1:
     loaded.imu_source = params.imu_source
     loaded.imu_gap_ns = params.imu_gap_ns
     loaded.restart_gap_ns = params.restart_gap_ns
-    loaded.gnss_reset_ns = params.gnss_reset_ns
-    loaded.gnss_return_ns = params.gnss_return_ns
     loaded.constraint_interval_ns = params.constraint_interval_ns
     loaded.still_after_ns = params.still_after_ns
     loaded.snapshot_interval_ns = params.snapshot_interval_ns
@@ -100,4 +99,6 @@ cdef int load_scalars(Parameters* loaded, params) except -1:
     loaded.still_accel = params.still_accel
     loaded.zero_velocity_factor = params.zero_velocity_factor
     loaded.heading_variance = params.heading_variance
+    loaded.spoof_cost = params.spoof_cost
+    loaded.dead_reckoning_cost = params.dead_reckoning_cost
     return 0

@@ -1,0 +1,337 @@
+"""Rival hypotheses: whole states that explain a contradiction in other ways, weighed by all that comes in (THEORY D4).
+
+When sources contradict the state, one of four things is so, and each has a place in the bank: the inertial sensor lied
+(INERTIAL), a receiver lies (RECEIVER), the state is wrong and the receiver right (RETURN), all wheels slip alike (WHEELS).
+Each is a whole state and covariance, carried and updated like the main one: without its liar, or with the uncertainty that
+the lie left behind. Its weight is its odds against the main state, by Bayes' rule from every reading that both judge.
+
+A rival begins when a change of the source (Shiryaev's statistic; the health of D1) has become likely enough, and ends when
+it has become unlikely, or when the expected loss says so (D5): then it becomes the main state. Until then the mixture's
+moments are published (B6), so that the covariance holds all that may be so.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusiond.filter.measurement_update import CLUTTER_DENSITY, cholesky, difference, inject, whiten
+from fusiond.filter.observations import GNSS_POSITION, WHEEL_SPEED
+from fusiond.filter.observations.model import COMPANION, Observation
+from fusiond.filter.parameters import Parameters
+from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS, begin, distrust, odds_of_bias
+from fusiond.filter.state import (
+    ACCEL_BIAS,
+    ALIVE,
+    ATTITUDE,
+    EXCLUDED,
+    GYRO_BIAS,
+    INERTIAL_DOUBT,
+    INERTIAL_ODDS,
+    POSITION,
+    POSITION_E,
+    RESET_SOURCE,
+    STATE_DOUBT,
+    SUSPECT,
+    T_POSITION,
+    VELOCITY,
+    FilterState,
+    ResetReason,
+    T,
+    count_reset,
+    is_finite,
+)
+from fusiond.maths.linear import mirror
+from fusiond.maths.portable import exp, square
+from fusiond.maths.typed import Matrix3, Vector3, compiled
+
+RIVALS = 4
+INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while the filter runs
+LEAST_ODDS = 1e-6  # of the inertial sensor having lied, while nothing speaks for it
+BEGIN = 0.01  # odds with which a rival begins
+END = 1e-7  # and below which it is given up
+MAX_ODDS = 1e12
+HONEST_AGAIN = 0.02  # odds that a receiver that lied is right again
+MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
+LIE_TURN = 0.1  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
+LIE_RATE = 0.1  # rad/s, by which its gyro bias may be another now
+LIE_SPEED = 1.0  # m/s, by which the velocity may be off
+LIE_FORCE = 1.0  # m/s^2, by which its accelerometer bias may be another now
+WRONG_RATE = 1e-4  # 1/s: how often dead reckoning goes wrong unnoticed
+MAX_WRONG = 0.9
+WRONG_AFTER_LIE = 0.5  # probability that the position is wrong after the inertial sensor lied
+
+
+@compiled
+def likelihood(innovation: Vector3, variance: Vector3, factor: float, m: int, spread: Matrix3) -> float:
+    """Density of an innovation (m,) with covariance `spread` + factor * diag(variance), up to (2 pi)^(-m/2), where a share
+    of all readings are outliers; 0 where that is not positive definite."""
+    lower, widened, whitened = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for a in range(m):
+        widened[a] = factor * variance[a]
+    if not cholesky(spread, widened, 1.0, m, lower) or not whiten(spread, innovation, widened, m, whitened):
+        return 0.0
+    distance, size = 0.0, 1.0
+    for a in range(m):
+        distance += whitened[a] * whitened[a]
+        size *= lower[a, a]
+    outlier = OUTLIERS * exp(-min(distance, MAX_SQUARE) / (2 * OUTLIER_VARIANCE))
+    for _a in range(m):
+        outlier /= 10.0  # the root of OUTLIER_VARIANCE
+    return ((1 - OUTLIERS) * exp(-min(distance, MAX_SQUARE) / 2) + outlier) / size
+
+
+@compiled
+def unread(variance: Vector3, factor: float, m: int, spread: Matrix3) -> float:
+    """What stands for the likelihood in a hypothesis that does not use a source: the one that a reading has on average
+    where it is used. So it says nothing for or against."""
+    lower, widened = np.empty((3, 3)), np.empty(3)
+    expected, size = 0.0, 1.0
+    for a in range(m):
+        widened[a] = factor * variance[a]
+        expected += (spread[a, a] + variance[a]) / (spread[a, a] + widened[a])
+    if not cholesky(spread, widened, 1.0, m, lower):
+        return 0.0
+    for a in range(m):
+        size *= lower[a, a]
+    return exp(-expected / 2) / size
+
+
+@compiled
+def lie_variance(k: int) -> float:
+    """What a lie of the inertial sensor adds to the variance of the k-th error state."""
+    if VELOCITY.start <= k < VELOCITY.stop:
+        return LIE_SPEED * LIE_SPEED
+    if ATTITUDE.start <= k < ATTITUDE.stop:
+        return LIE_TURN * LIE_TURN
+    if GYRO_BIAS.start <= k < GYRO_BIAS.stop:
+        return LIE_RATE * LIE_RATE
+    if ACCEL_BIAS.start <= k < ACCEL_BIAS.stop:
+        return LIE_FORCE * LIE_FORCE
+    return 0.0
+
+
+@compiled
+def watch_inertial(state: FilterState, seen: Observation, factor: float, spread: Matrix3, fits: float) -> None:
+    """Weigh the hypothesis that the inertial sensor lied a moment ago by one observation, of likelihood `fits` under the
+    main state: Shiryaev's odds of a change. When they are worth it, the rival begins."""
+    a = state.auxiliary
+    if state.bank[INERTIAL, 0] > 0 or state.nominal[INERTIAL_DOUBT] > 0.3 or not fits > 0:
+        return
+    widened = np.empty((3, 3))
+    for i in range(seen.m):
+        for j in range(seen.m):
+            widened[i, j] = spread[i, j]
+            for k in range(VELOCITY.start, ACCEL_BIAS.stop):
+                widened[i, j] += seen.jacobian[i, k] * lie_variance(k) * seen.jacobian[j, k]
+    lied = likelihood(seen.innovation, seen.variance, factor, seen.m, widened)
+    a[INERTIAL_ODDS] = min(max(a[INERTIAL_ODDS], LEAST_ODDS) * (lied / fits), MAX_ODDS)
+    if a[INERTIAL_ODDS] >= BEGIN:
+        _suspect_motion(state, BEGIN)
+
+
+@compiled
+def _suspect_motion(state: FilterState, odds: float) -> None:
+    """Begin the rivals in which the inertial sensor lied, and in which all wheels do, where they are not there yet."""
+    if state.bank[INERTIAL, 0] == 0:
+        open_slot(state, INERTIAL, odds)
+        rival = state.hypothesis(INERTIAL)
+        rival.nominal[INERTIAL_DOUBT] = 1.0
+        for k in range(VELOCITY.start, ACCEL_BIAS.stop):
+            rival.covariance[k, k] += lie_variance(k)
+    if state.bank[WHEELS, 0] == 0:
+        open_slot(state, WHEELS, odds)
+    state.auxiliary[INERTIAL_ODDS] = LEAST_ODDS
+
+
+@compiled
+def open_slot(state: FilterState, slot: int, odds: float) -> None:
+    """Begin a rival as a copy of the main state."""
+    if state.bank[slot, 0] == 0:
+        state.stamps[ALIVE] += 1
+    state.bank[slot, 0] = odds
+    rival = state.hypothesis(slot)
+    rival.nominal[:] = state.nominal
+    for k in range(state.size):
+        rival.covariance[k] = state.covariance[k]
+
+
+@compiled
+def close_slot(state: FilterState, slot: int) -> None:
+    """Give a rival up."""
+    if state.bank[slot, 0] > 0:
+        state.stamps[ALIVE] -= 1
+    state.bank[slot] = 0.0
+
+
+@compiled
+def uses(state: FilterState, slot: int, source: int, params: Parameters) -> bool:
+    """Whether a rival uses a source."""
+    if slot == WHEELS and params.models[source] == WHEEL_SPEED:
+        return False
+    suspect = int(state.stamps[SUSPECT])
+    if suspect >= 0 and (source == suspect or source == int(params.model_parameters[suspect, COMPANION])):
+        if slot == RECEIVER:
+            return False
+        if slot == RETURN:
+            return True
+    return state.memory[source, EXCLUDED] == 0
+
+
+@compiled
+def weigh(state: FilterState, slot: int, own: float, main: float) -> None:
+    """Bayes' rule for one rival: its likelihood of a reading against the main state's."""
+    if own > 0 and main > 0:
+        state.bank[slot, 0] = min(state.bank[slot, 0] * (own / main), MAX_ODDS)
+
+
+@compiled
+def suspect_receiver(state: FilterState, source: int, before: float, params: Parameters) -> None:
+    """Follow the health of a GNSS source (D1), whose odds of being biased were `before`: begin a rival that does without
+    the receiver, or weigh it; and one in which the state is wrong, as likely as dead reckoning makes that."""
+    odds = odds_of_bias(state.memory[source])
+    suspect = position_of(source, params)
+    if state.bank[RECEIVER, 0] > 0:
+        if state.stamps[SUSPECT] == suspect and before > 0:
+            state.bank[RECEIVER, 0] = min(state.bank[RECEIVER, 0] * (odds / before), MAX_ODDS)
+        return
+    if odds < BEGIN or state.memory[source, EXCLUDED] != 0 or suspect < 0:
+        return
+    state.stamps[SUSPECT] = suspect
+    open_slot(state, RECEIVER, min(odds, MAX_ODDS))
+    _suspect_motion(state, min(odds, MAX_ODDS) * BEGIN)
+
+
+@compiled
+def returns(distance: float, m: int, params: Parameters) -> bool:
+    """Whether a receiver that was found to lie is taken back, by a squared whitened innovation: it is right now rather than
+    lying by chance where it would read if it were right. Lies are uniform over a field of CLUTTER_FIELD sigmas an axis."""
+    odds = HONEST_AGAIN * exp(-min(distance, MAX_SQUARE) / 2)
+    for _a in range(m):
+        odds /= CLUTTER_DENSITY
+    return odds * params.dead_reckoning_cost >= params.spoof_cost
+
+
+@compiled
+def position_of(source: int, params: Parameters) -> int:
+    """The position source of the receiver that a GNSS source belongs to."""
+    if params.models[source] == GNSS_POSITION:
+        return source
+    for i in range(len(params.models)):
+        if params.models[i] == GNSS_POSITION and int(params.model_parameters[i, COMPANION]) == source:
+            return i
+    return -1
+
+
+@compiled
+def wrong(state: FilterState, carried: bool) -> float:
+    """Probability that the state's position is wrong, for all that its covariance says: the longer no position was fused,
+    the likelier."""
+    if carried:
+        return MAX_WRONG
+    since = (state.stamps[T] - state.stamps[T_POSITION]) * 1e-9
+    return min(state.auxiliary[STATE_DOUBT] + WRONG_RATE * max(since, 0.0), MAX_WRONG)
+
+
+@compiled
+def decide(state: FilterState, params: Parameters) -> None:
+    """Give up rivals that have become unlikely, and let one lead where the expected loss is less so."""
+    total = 1.0
+    for slot in range(RIVALS):
+        if state.bank[slot, 0] > 0:
+            hypothesis = state.hypothesis(slot)
+            if not is_finite(hypothesis):
+                close_slot(state, slot)
+            total += state.bank[slot, 0]
+    for slot in range(RIVALS):
+        if 0 < state.bank[slot, 0] < END * total:
+            close_slot(state, slot)
+    inertial = state.hypothesis(INERTIAL)
+    if state.bank[INERTIAL, 0] > 0 and inertial.nominal[INERTIAL_DOUBT] < 0.05:  # it has had its time
+        if state.bank[INERTIAL, 0] < 1:
+            close_slot(state, INERTIAL)
+        if 0 < state.bank[WHEELS, 0] < 1:
+            close_slot(state, WHEELS)
+    for slot in range(RIVALS):
+        odds = state.bank[slot, 0]
+        if odds > 0:
+            needed = 1.0
+            against = total - odds
+            if slot == RECEIVER:
+                rival = state.hypothesis(RECEIVER)
+                apart, blurred = 1e-9, 0.0
+                for i in range(3):
+                    apart += square(rival.nominal[POSITION_E.start + i] - state.nominal[POSITION_E.start + i])
+                    blurred += rival.covariance[POSITION.start + i, POSITION.start + i]
+                needed = params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
+            elif slot == RETURN:
+                needed = params.spoof_cost / params.dead_reckoning_cost
+            if odds >= needed * against:
+                _lead(state, slot, params)
+                return
+
+
+@compiled
+def _lead(state: FilterState, slot: int, params: Parameters) -> None:
+    """Let a rival be the main state, and give up the others."""
+    rival = state.hypothesis(slot)
+    suspect = int(state.stamps[SUSPECT])
+    state.nominal[:] = rival.nominal
+    for k in range(state.size):
+        state.covariance[k] = rival.covariance[k]
+    for other in range(RIVALS):
+        close_slot(state, other)
+    if slot == INERTIAL:
+        state.auxiliary[STATE_DOUBT] = WRONG_AFTER_LIE
+        count_reset(state, ResetReason.INERTIAL_LIED)
+        for source in range(state.sources):
+            state.memory[source, EXCLUDED] = 0.0
+            begin(state.memory[source])
+    elif slot == WHEELS:
+        for source in range(state.sources):
+            if params.models[source] == WHEEL_SPEED:
+                distrust(state.memory[source])
+    elif slot == RECEIVER:
+        exclude(state, suspect, 1.0, params)
+    else:
+        exclude(state, suspect, 0.0, params)
+        count_reset(state, ResetReason.SOURCE_RETURNED)
+        state.stamps[RESET_SOURCE] = suspect
+
+
+@compiled
+def exclude(state: FilterState, suspect: int, excluded: float, params: Parameters) -> None:
+    """Exclude a receiver, or take it back; its health begins anew."""
+    companion = int(params.model_parameters[suspect, COMPANION])
+    state.memory[suspect, EXCLUDED] = excluded
+    begin(state.memory[suspect])
+    if companion >= 0:
+        state.memory[companion, EXCLUDED] = excluded
+        begin(state.memory[companion])
+
+
+@compiled
+def mix(state: FilterState) -> None:
+    """Make the state the mixture's: its mean and covariance, about the main state (B6)."""
+    total = 1.0
+    for slot in range(RIVALS):
+        total += state.bank[slot, 0]
+    errors, mean = np.zeros((RIVALS, state.size)), np.zeros(state.size)
+    for slot in range(RIVALS):
+        if state.bank[slot, 0] > 0:
+            rival = state.hypothesis(slot)
+            errors[slot] = difference(rival, state)
+            mean += state.bank[slot, 0] / total * errors[slot]
+    p = state.covariance
+    for j in range(state.size):
+        p[j] *= 1 / total
+        p[j] += mean[j] / total * mean
+    for slot in range(RIVALS):
+        if state.bank[slot, 0] > 0:
+            weight = state.bank[slot, 0] / total
+            rival = state.hypothesis(slot)
+            for j in range(state.size):
+                p[j] += weight * (rival.covariance[j] + (errors[slot, j] - mean[j]) * (errors[slot] - mean))
+    mirror(p)
+    inject(state, mean)
