@@ -16,7 +16,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.study.recorded import LOOK_NS, Recorded, Watched, town, watch, write_trace
+from benchmarks.study.recorded import (
+    DISHONEST_M,
+    DISHONEST_SIGMAS,
+    LOOK_S,
+    Recorded,
+    Watched,
+    town,
+    watch,
+    write_trace,
+)
 from benchmarks.study.report import Section
 from benchmarks.study.tampering import (
     ACCEL,
@@ -41,7 +50,6 @@ from benchmarks.study.tampering import (
     with_velocity,
 )
 from fusiond.events import ImuSample, Received
-from fusiond.maths.typed import Array
 from fusiond.simulation.scenario import WHEELS
 from fusiond.simulation.wire import GNSS, IMU
 from fusiond.units import SECOND
@@ -50,10 +58,7 @@ DRIVE_S = 400.0
 EARLIEST_S, LATEST_S = 80.0, 120.0  # of the beginning of an attack: the filter has learnt its biases
 AFTER_S = 60.0  # for which a run goes on after the attack
 HALF_MINUTE, MINUTE, LONG = 30.0, 60.0, 180.0
-DISHONEST_M, DISHONEST_SIGMAS = 2.0, 3.0  # an error is dishonest that exceeds both
-PAUSE_S = 1.0  # between two fused fixes, of a receiver that is fused
 RETURNED_S = 0.15  # after the end of an attack, until the last fix that it has touched has arrived
-LOOK_S = LOOK_NS / SECOND
 ALL = "wheels"  # of the sources that an attack aims at
 
 
@@ -182,7 +187,6 @@ def judged(found: Watched, attack: Attack, begin: float, v_max: float) -> Found:
     t, distance, sigmas = np.array(found.t), found.distance(), found.sigmas()
     end = begin + attack.seconds
     since, during, after = t >= begin, (t >= begin) & (t < end), t >= end
-    dishonest = since & (distance > DISHONEST_M) & (sigmas > DISHONEST_SIGMAS)
     fused, rejected = (np.array(of[f"{GNSS}.position"]) for of in (found.fused, found.rejected))
     k = min(int(np.searchsorted(t, end + RETURNED_S)), len(t) - 1)
     taken, refused = int(fused[-1] - fused[k]), int(rejected[-1] - rejected[k])
@@ -201,9 +205,9 @@ def judged(found: Watched, attack: Attack, begin: float, v_max: float) -> Found:
         during=float(np.nanmax(distance[during], initial=0.0)),
         after=float(np.nanmax(distance[after], initial=0.0)),
         sigmas=float(np.nanmax(sigmas[since])),
-        dishonest=float(dishonest.sum() * LOOK_S),
+        dishonest=float((since & found.dishonest()).sum() * LOOK_S),
         beyond=float((since & (sigmas > DISHONEST_SIGMAS)).sum() * LOOK_S),
-        back=returned(t[k:], fused[k:]) - end,
+        back=found.returned(f"{GNSS}.position", end + RETURNED_S) + RETURNED_S,
         share=taken / max(1, taken + refused),
         named=named,
         called=called.most_common(1)[0][0] if called else "-",
@@ -212,16 +216,6 @@ def judged(found: Watched, attack: Attack, begin: float, v_max: float) -> Found:
         too_fast=bool((speeds > v_max).any()),
         resets=found.resets,
     )
-
-
-def returned(t: Array, fused: Array) -> float:
-    """The instant [s] from which on fixes are fused with no pause of more than a second; inf: not by the end."""
-    taken = t[1:][np.diff(fused) > 0]
-    ends = np.append(taken, t[-1])
-    pauses = np.flatnonzero(np.diff(ends, prepend=t[0]) > PAUSE_S)
-    if len(pauses) == 0:
-        return float(ends[0])
-    return float(ends[pauses[-1]]) if pauses[-1] < len(taken) else math.inf
 
 
 def chunk(names: Sequence[str], seed: int, run: int) -> list[tuple[str, int, Found]]:

@@ -23,6 +23,7 @@ from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import Received
 from fusiond.filter.rows import Outcome
+from fusiond.maths.statistics import chi_square
 from fusiond.maths.typed import Array
 from fusiond.simulation.drive import simulate
 from fusiond.simulation.matching import configuration, dbc
@@ -32,6 +33,10 @@ from fusiond.simulation.wgs84 import radii
 from fusiond.units import SECOND, nanoseconds
 
 LOOK_NS = SECOND // 10
+LOOK_S = LOOK_NS / SECOND
+SIGMAS_95 = math.sqrt(chi_square(0.95, 2))  # of the ellipse that holds 95 % of horizontal errors
+DISHONEST_M, DISHONEST_SIGMAS = 2.0, 3.0  # an error is dishonest that exceeds both
+PAUSE_S = 1.0  # between two fused fixes, of a receiver that is fused
 DBC_NAME = "drive.dbc"
 WHEEL_HZ = 20.0
 Segment = dict[str, float]
@@ -61,10 +66,13 @@ def road(random: np.random.Generator, seconds: float) -> list[Segment]:
     return segments
 
 
-def scenario(random: np.random.Generator, seconds: float, **tables: dict[str, Any]) -> Scenario:
-    """The road with the installation's errors drawn at random, and some keys of the scenario's tables changed."""
+def scenario(
+    random: np.random.Generator, seconds: float, segments: list[Segment] | None = None, **tables: dict[str, Any]
+) -> Scenario:
+    """The road, or another course, with the installation's errors drawn at random, and some keys of the scenario's tables
+    changed."""
     raw: dict[str, Any] = {
-        "segment": road(random, seconds),
+        "segment": road(random, seconds) if segments is None else segments,
         "start": {"heading_deg": float(random.uniform(-180, 180))},
         "imu": {"mount_deg": [0.0, *(float(angle) for angle in random.normal(0, 0.5, 2))]},
         "wheels": {"rate_hz": WHEEL_HZ, "scale_error": float(random.normal(0, 0.005)), "chatter": False},
@@ -72,6 +80,27 @@ def scenario(random: np.random.Generator, seconds: float, **tables: dict[str, An
     for name, keys in tables.items():
         raw[name] = raw.get(name, {}) | keys
     return msgspec.convert(raw, Scenario)
+
+
+def installed(config: Config) -> Config:
+    """The configuration with nothing said of the receiver's noise: as the defaults have it."""
+    receivers = {
+        name: type(gnss)(**{key: getattr(gnss, key) for key in ("link", "message", "lever_arm_m", "delay_ms", "interval_s")})
+        for name, gnss in config.gnss.items()
+    }
+    return msgspec.structs.replace(config, gnss=receivers)
+
+
+def changed(config: Config, table: str, **keys: Any) -> Config:
+    """The configuration with keys of a table, or of every sensor of a kind, changed: to a value, or by a function."""
+
+    def rewritten(section: Any) -> Any:
+        values = {key: new(getattr(section, key)) if callable(new) else new for key, new in keys.items()}
+        return msgspec.structs.replace(section, **values)
+
+    old = getattr(config, table)
+    new = {name: rewritten(section) for name, section in old.items()} if isinstance(old, dict) else rewritten(old)
+    return msgspec.structs.replace(config, **{table: new})
 
 
 def written(drive: Scenario) -> Config:
@@ -126,6 +155,12 @@ class Watched:
     ratios: dict[str, list[float]] = field(default_factory=dict)  # newest test ratio, where asked for
     resets: int = 0
 
+    @property
+    def started_s(self) -> float:
+        """When the first state was published [s] (inf: never)."""
+        known = np.flatnonzero(np.isfinite(self.distance()))
+        return self.t[known[0]] if len(known) else math.inf
+
     def distance(self) -> Array:
         """Horizontal error (N,) [m]."""
         return np.asarray(np.hypot(*np.array(self.errors).T))
@@ -134,6 +169,36 @@ class Watched:
         """Horizontal error (N,) in published sigmas: the Mahalanobis distance."""
         off, claimed = np.array(self.errors), np.array(self.covariances)
         return np.asarray(np.sqrt(np.einsum("ti,ti->t", off, np.linalg.solve(claimed, off[..., None])[..., 0])))
+
+
+    def claimed(self) -> Array:
+        """Published sigma (N,) [m] of the horizontal error."""
+        return np.asarray(np.sqrt(np.trace(np.array(self.covariances), axis1=1, axis2=2)))
+
+    def dishonest(self) -> NDArray[np.bool_]:
+        """Whether the error (N,) exceeds both what matters and what is claimed."""
+        return np.asarray((self.distance() > DISHONEST_M) & (self.sigmas() > DISHONEST_SIGMAS))
+
+    def returned(self, source: str, begin: float) -> float:
+        """How long after an instant [s] its events are fused for good, without a pause of more than a second; inf: not by
+        the end."""
+        k = min(int(np.searchsorted(self.t, begin)), len(self.t) - 1)
+        t, fused = np.array(self.t[k:]), self.fused[source][k:]
+        taken = t[1:][np.diff(fused) > 0]
+        ends = np.append(taken, t[-1])
+        pauses = np.flatnonzero(np.diff(ends, prepend=t[0]) > PAUSE_S)
+        if len(pauses) == 0:
+            return float(ends[0]) - begin
+        return float(ends[pauses[-1]]) - begin if pauses[-1] < len(taken) else math.inf
+
+    def between(self, start: float, stop: float) -> NDArray[np.bool_]:
+        """Which looks (N,) lie in [start, stop) s and have a state."""
+        t = np.array(self.t)
+        return np.asarray((t >= start) & (t < stop) & np.isfinite(self.distance()))
+
+    def bad(self, rows: NDArray[np.bool_]) -> dict[str, float]:
+        """By source the share of these looks at which it was not nominal."""
+        return {source: float((np.array(status)[rows] != "nominal").mean()) for source, status in self.statuses.items()}
 
 
 UNKNOWN = np.full((2, 2), np.nan)
