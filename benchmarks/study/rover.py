@@ -95,8 +95,8 @@ def rover(runs: int, seed: int) -> Section:
     section.say(
         f"{runs} drives of the simulator, seed {seed}: about 1 m/s with bends and stops, IMU 30 Hz, four unsteered wheels "
         f"at 10 Hz that read {SCALE:.1%} too high, GNSS 2.5 Hz. In bends the wheels' difference is 1.5 times that of a "
-        "vehicle that does not slide. The configuration is the one that the simulator writes, with the default sigma of the wheel "
-        "scale (1 %). Off: the learnt scale's worst distance from the truth, in its own sigmas."
+        "vehicle that does not slide. The configuration is the one that the simulator writes, with the default sigma of the "
+        "wheel scale (1 %). Off: the learnt scale's worst distance from the truth, in its own sigmas."
     )
     rows = []
     for name in CASES:
