@@ -75,8 +75,8 @@ def _imu(drive: Drive) -> Stamped:
 def _gnss(drive: Drive) -> Stamped:
     gnss, fixes = drive.gnss, drive.gnss.fixes
     fields = (fixes.fix_type, fixes.lat, fixes.lon, fixes.alt, fixes.alt_ellipsoid, fixes.vel, fixes.cog)
-    columns = (gnss.t_receive_us, gnss.counter, gnss.time_us, *fields)
-    for t_us, counter, time_us, fix_type, lat, lon, alt, ellipsoid, vel, cog in zip(
+    columns = (gnss.t_receive_us, gnss.counter, gnss.time_us, *fields, fixes.h_acc, fixes.v_acc)
+    for t_us, counter, time_us, fix_type, lat, lon, alt, ellipsoid, vel, cog, h_acc, v_acc in zip(
         *(column.tolist() for column in columns), strict=True
     ):
         known = vel != UNKNOWN_16
@@ -92,8 +92,8 @@ def _gnss(drive: Drive) -> Stamped:
             cog=cog,
             satellites_visible=SATELLITES if known else 0,
             alt_ellipsoid=ellipsoid,
-            h_acc=fixes.h_acc,
-            v_acc=fixes.v_acc,
+            h_acc=h_acc,
+            v_acc=v_acc,
             vel_acc=fixes.vel_acc,
         )
 

@@ -12,7 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.study import calibration, consistency, faults, ferry, heading, outage, reboot
+from benchmarks.study import (
+    attacks,
+    calibration,
+    consistency,
+    faults,
+    ferry,
+    gaps,
+    heading,
+    mismatch,
+    outage,
+    reboot,
+    rover,
+    rtk,
+)
 from benchmarks.study.report import Section, save
 from fusiond import __version__
 
@@ -25,6 +38,11 @@ PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the numbe
     "calibration": (calibration.calibration, 20),
     "ferry": (ferry.ferry, 10),
     "reboot": (reboot.reboot, 100),
+    "attacks": (attacks.attacks, 20),
+    "gaps": (gaps.gaps, 20),
+    "mismatch": (mismatch.mismatch, 10),
+    "rtk": (rtk.rtk, 10),
+    "rover": (rover.rover, 20),
 }
 
 

@@ -43,7 +43,7 @@ GENERATORS = (
     *WHEELS,
     *("imu_link", "gnss_link", "time_link", "heartbeat_link", "wheels_link", "steering_link", "speed_link", "beacons"),
     *("telemetry_link", "traffic_link", "traffic_data"),
-    *("pressure", "pressure_link"),
+    *("pressure", "pressure_link", "gnss_quality"),
 )
 
 
@@ -138,8 +138,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Drive:
     truth, samples = _truth_and_imu(run)
     t_fix, t_beacon = _fix_instants(run), run.instants(1.0, BEACON_PHASE_S)
     t_beacon += run.random["beacons"].uniform(0, BEACON_SCATTER_S, len(t_beacon))
-    generators = (run.random["gnss_white"], run.random["gnss_drift"], run.random["gnss_velocity"])
-    fixes = gnss.measure(scenario, run.trajectory, t_fix, generators)
+    white, drift, velocity, quality = (run.random[f"gnss_{name}"] for name in ("white", "drift", "velocity", "quality"))
+    fixes = gnss.measure(scenario, run.trajectory, t_fix, (white, drift, velocity, quality))
     t_sample_ns, t_fix_ns, t_beacon_ns = run.unix(run.trajectory.t), run.unix(t_fix), run.unix(t_beacon)
     t_pressure = run.instants(scenario.barometer.rate_hz, PRESSURE_PHASE_S)
     t_pressure_ns, height = run.unix(t_pressure), np.interp(t_pressure, run.trajectory.t, truth.height)
@@ -247,6 +247,8 @@ def _rows(fixes: Fixes, rows: Stamps) -> Fixes:
         alt_ellipsoid=fixes.alt_ellipsoid[rows],
         vel=fixes.vel[rows],
         cog=fixes.cog[rows],
+        h_acc=fixes.h_acc[rows],
+        v_acc=fixes.v_acc[rows],
     )
 
 

@@ -1,14 +1,14 @@
-"""The simulated GNSS receiver: noise, smoothed velocity, outages, jumps, a spoofer, a frozen fix; wire units out."""
+"""The simulated GNSS receiver: noise, fix types, smoothed velocity, outages, jumps, a spoofer, a frozen fix; wire units."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.maths.typed import Array
-from fusiond.simulation.scenario import Gnss, Scenario
+from fusiond.simulation.scenario import FixType, Gnss, Scenario
 from fusiond.simulation.trajectory import Trajectory, turned
 from fusiond.simulation.transport import Mask, within
 from fusiond.simulation.wgs84 import shifted, wrapped
@@ -16,12 +16,14 @@ from fusiond.simulation.wgs84 import shifted, wrapped
 Integers = NDArray[np.int64]
 LAG_POINTS = 8  # instants over which the smoothed velocity is a mean
 FIX_3D, FIX_NONE = 3, 1  # GPS_FIX_TYPE
+FIX_TYPES: dict[FixType, int] = {"single": FIX_3D, "dgps": 4, "float": 5, "fixed": 6}
+HEIGHT_FACTOR = 2.0  # how much worse heights are, by quality
 UNKNOWN_16 = 65535
 
 
 @dataclass(frozen=True, slots=True)
 class Fixes:
-    """N fixes in the units of GPS_RAW_INT; h_acc, v_acc [mm] and vel_acc [mm/s] are the same for all."""
+    """N fixes in the units of GPS_RAW_INT; vel_acc [mm/s] is the same for all."""
 
     fix_type: Integers
     lat: Integers  # 1e-7 deg
@@ -30,8 +32,8 @@ class Fixes:
     alt_ellipsoid: Integers  # mm
     vel: Integers  # cm/s
     cog: Integers  # 1e-2 deg
-    h_acc: int
-    v_acc: int
+    h_acc: Integers  # mm
+    v_acc: Integers  # mm
     vel_acc: int
 
 
@@ -58,17 +60,17 @@ def measure(
     scenario: Scenario,
     trajectory: Trajectory,
     t: Array,
-    randoms: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
+    randoms: tuple[np.random.Generator, np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> Fixes:
-    """The fixes of the instants `t` (N,) [s]. The generators are those of white, drifting and velocity noise."""
+    """The fixes of the instants `t` (N,) [s]. The generators are those of white, drifting and velocity noise, and of the
+    biases by quality."""
     gnss = scenario.gnss
     place, _ = antenna(trajectory, gnss, t)
     velocity = smoothed_velocity(trajectory, gnss, t)
-    white = np.array([gnss.sigma_m, gnss.sigma_m, gnss.height_sigma_m])
-    drift = np.array([gnss.drift_sigma_m, gnss.drift_sigma_m, gnss.height_drift_sigma_m])
-    error_n = randoms[0].standard_normal((len(t), 3)) * white
-    error_n += gauss_markov(len(t), 1 / gnss.rate_hz, gnss.correlation_s, randoms[1]) * drift
-    velocity = velocity + randoms[2].standard_normal((len(t), 3)) * gnss.velocity_sigma_mps
+    kind = qualities(gnss, t, randoms[3])
+    error_n = randoms[0].standard_normal((len(t), 3)) * kind.white
+    error_n += gauss_markov(len(t), 1 / gnss.rate_hz, gnss.correlation_s, randoms[1]) * kind.drift + kind.bias
+    velocity = velocity + velocity_noise(gnss, len(t), randoms[2]) * gnss.velocity_sigma_mps
     for jump in gnss.jump:
         error_n[within(t, [(jump.start_s, jump.stop_s)])] += jump.offset_m
     for spoof in gnss.spoof:
@@ -77,7 +79,42 @@ def measure(
         velocity[caught] += spoof.rate_mps
     held = last_before(t, within(t, gnss.frozen_s))
     place = (place[0][held], place[1][held], place[2][held])
-    return _wire(gnss, shifted(*place, error_n[held]), velocity[held], within(t, gnss.no_fix_s))
+    kind = replace(kind, fix_type=kind.fix_type[held], sigma=kind.sigma[held])
+    return _wire(gnss, shifted(*place, error_n[held]), velocity[held], within(t, gnss.no_fix_s), kind)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What N fixes are worth: their type, the sigmas [m] (N, 3) of white and drifting noise, the bias, and all in one."""
+
+    fix_type: Integers
+    white: Array
+    drift: Array
+    bias: Array
+    sigma: Array
+
+
+def qualities(gnss: Gnss, t: Array, random: np.random.Generator) -> Kind:
+    """The fixes' worth at the times `t` (N,) [s]."""
+    fix_type: Integers = np.full(len(t), FIX_3D)
+    white = np.tile([gnss.sigma_m, gnss.sigma_m, gnss.height_sigma_m], (len(t), 1))
+    drift = np.tile([gnss.drift_sigma_m, gnss.drift_sigma_m, gnss.height_drift_sigma_m], (len(t), 1))
+    bias, sigma = np.zeros((len(t), 3)), np.hypot(white, drift)
+    weight = np.array([1.0, 1.0, HEIGHT_FACTOR])
+    for quality in gnss.quality:
+        drawn, after = random.standard_normal(3), t >= quality.start_s
+        fix_type[after] = FIX_TYPES[quality.fix]
+        white[after], drift[after] = quality.sigma_m * weight, 0.0
+        bias[after] = drawn * quality.bias_sigma_m * weight
+        sigma[after] = np.hypot(quality.sigma_m, quality.bias_sigma_m) * weight
+    return Kind(fix_type, white, drift, bias, sigma)
+
+
+def velocity_noise(gnss: Gnss, count: int, random: np.random.Generator) -> Array:
+    """Noise (N, 3) of unit variance, white or alike for a while."""
+    if gnss.velocity_correlation_s:
+        return gauss_markov(count, 1 / gnss.rate_hz, gnss.velocity_correlation_s, random)
+    return random.standard_normal((count, 3))
 
 
 def smoothed_velocity(trajectory: Trajectory, gnss: Gnss, t: Array) -> Array:
@@ -95,23 +132,22 @@ def last_before(t: Array, frozen: Mask) -> Integers:
     return np.maximum.accumulate(own)
 
 
-def _wire(gnss: Gnss, place: tuple[Array, Array, Array], velocity: Array, no_fix: Mask) -> Fixes:
+def _wire(gnss: Gnss, place: tuple[Array, Array, Array], velocity: Array, no_fix: Mask, kind: Kind) -> Fixes:
     def whole(values: Array) -> Integers:
         return np.where(no_fix, 0, np.rint(values).astype(np.int64))
 
     ellipsoid = place[2] * 1000
     course = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0])) % 360
-    horizontal = np.hypot(gnss.sigma_m, gnss.drift_sigma_m) if gnss.report_accuracy else 0.0
-    vertical = np.hypot(gnss.height_sigma_m, gnss.height_drift_sigma_m) if gnss.report_accuracy else 0.0
+    accuracy = np.rint(kind.sigma * 1000).astype(np.int64) * gnss.report_accuracy
     return Fixes(
-        fix_type=np.where(no_fix, FIX_NONE, FIX_3D),
+        fix_type=np.where(no_fix, FIX_NONE, kind.fix_type),
         lat=whole(np.degrees(place[0]) * 1e7),
         lon=whole(np.degrees(wrapped(place[1])) * 1e7),
         alt=whole(ellipsoid - gnss.geoid_m * 1000),
         alt_ellipsoid=whole(ellipsoid),
         vel=np.where(no_fix, UNKNOWN_16, np.rint(np.hypot(velocity[:, 0], velocity[:, 1]) * 100).astype(np.int64)),
         cog=np.where(no_fix, UNKNOWN_16, np.rint(course * 100).astype(np.int64) % 36000),
-        h_acc=round(float(horizontal) * 1000),
-        v_acc=round(float(vertical) * 1000),
+        h_acc=accuracy[:, 0],
+        v_acc=accuracy[:, 2],
         vel_acc=round(gnss.velocity_sigma_mps * 1000) if gnss.report_accuracy else 0,
     )

@@ -126,6 +126,7 @@ position_sigma_m = {max(horizontal, MIN_NOISE):.3g}  # horizontal, per axis
 height_sigma_m = {max(vertical, MIN_NOISE):.3g}
 velocity_sigma_mps = {max(gnss.velocity_sigma_mps, MIN_NOISE):.3g}  # per axis
 position_correlation_s = {share * gnss.correlation_s:.3g}  # correlation time of position errors [s]
+velocity_correlation_s = {gnss.velocity_correlation_s:g}  # of velocity errors [s]
 interval_s = {1 / gnss.rate_hz:.6g}  # spacing of the fixes [s]
 """
 
@@ -152,7 +153,7 @@ unsigned = {str(spec.unsigned).lower()}  # amount only, no direction
 valid_signal = "{FAULT_SIGNAL}"  # must be valid_value, 0
 counter_signal = "{COUNTER_SIGNAL}"  # a repeated value marks a stale frame
 position_m = {_from_imu(scenario, place)}  # its contact point
-steered = {str(name.startswith("front")).lower()}  # it measures the speed along its own track
+steered = {str(name.startswith(scenario.vehicle.steering)).lower()}  # it measures the speed along its own track
 sigma_mps = {sigma:.3g}  # of a reading
 correlation_s = {(own / sigma) ** 2 * OWN_SCALE_CORRELATION_S:.3g}  # correlation time of its errors [s]
 quantum_mps = {spec.resolution_kmh / 3.6:.3g}  # step of the signal

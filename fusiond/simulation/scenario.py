@@ -18,6 +18,7 @@ from fusiond.config.toml import Name, NotNegative, Positive, Section, Vector, de
 Degrees = Annotated[float, Meta(ge=-360, le=360)]
 Interval = tuple[float, float]  # [start, stop) s
 Share = Annotated[float, Meta(ge=0, lt=1)]
+FixType = Literal["single", "dgps", "float", "fixed"]
 WheelName = Literal["front_left", "front_right", "rear_left", "rear_right"]
 WHEELS: tuple[WheelName, ...] = get_args(WheelName)
 SHORTEST_DRIVE_S = 1.0
@@ -52,6 +53,9 @@ class Body(Section, frozen=True, kw_only=True):
     wheelbase_m: Positive = 2.7  # front axle to rear axle
     track_m: Positive = 1.55  # left wheels to right wheels
     roll_deg_per_mps2: float = 0.4  # lean of the body out of a bend, per lateral acceleration
+    slip_deg_per_mps2: Annotated[float, Meta(ge=0, le=5)] = 0.0  # slip angle of the rear axle, likewise; a car's: 0.4 to 0.7
+    steering: Literal["front", "skid"] = "front"  # "skid": no wheel is steered, and all slide sideways in a bend
+    skid: Annotated[float, Meta(ge=1, le=5)] = 1.5  # how much more than in a bend without sliding such wheels differ
 
 
 class Transport(Section, frozen=True, kw_only=True):
@@ -126,6 +130,16 @@ class Spoof(Section, frozen=True, kw_only=True):
     rate_mps: Vector  # north, east, down
 
 
+class Quality(Section, frozen=True, kw_only=True):
+    """[[gnss.quality]]: from then on the fixes are of another type, whose errors are white noise and a bias that is drawn at
+    the change and stays until the next. In height both are twice as large. They replace the position's other noise."""
+
+    start_s: NotNegative  # from
+    fix: FixType  # what the receiver calls the fixes
+    sigma_m: NotNegative  # white, horizontal, per axis
+    bias_sigma_m: NotNegative = 0.0  # of the bias, horizontal, per axis
+
+
 class Gnss(Section, frozen=True, kw_only=True):
     """[gnss]: GPS_RAW_INT."""
 
@@ -139,7 +153,8 @@ class Gnss(Section, frozen=True, kw_only=True):
     drift_sigma_m: NotNegative = 0.5  # Gauss-Markov, horizontal, per axis
     height_drift_sigma_m: NotNegative = 1.0  # Gauss-Markov, vertical
     correlation_s: Positive = 60.0  # of the Gauss-Markov part
-    velocity_sigma_mps: NotNegative = 0.08  # white, per axis
+    velocity_sigma_mps: NotNegative = 0.08  # per axis
+    velocity_correlation_s: NotNegative = 0.0  # of the velocity's errors; 0: white
     report_accuracy: bool = True  # fill h_acc, v_acc, vel_acc, else 0 = unknown
     geoid_m: float = 0.0  # height of mean sea level above the ellipsoid
     outage_s: list[Interval] = field(default_factory=list)  # no messages
@@ -147,6 +162,7 @@ class Gnss(Section, frozen=True, kw_only=True):
     frozen_s: list[Interval] = field(default_factory=list)  # the last fix again and again, with new stamps
     jump: list[Jump] = field(default_factory=list)
     spoof: list[Spoof] = field(default_factory=list)
+    quality: list[Quality] = field(default_factory=list)
     transport: Transport = field(default_factory=Transport)
 
 
@@ -279,6 +295,10 @@ def _impossible_values(scenario: Scenario) -> Iterator[tuple[str, str]]:
                 yield f"{key}[{index}].stop_s", f"must be later than start_s ({entry.start_s})"
     if scenario.duration_s < SHORTEST_DRIVE_S:
         yield "segment[0].duration_s", f"the whole drive must last {SHORTEST_DRIVE_S:g} s or longer"
+    starts = [quality.start_s for quality in gnss.quality]
+    for index in range(1, len(starts)):
+        if starts[index] <= starts[index - 1]:
+            yield f"gnss.quality[{index}].start_s", f"must be later than that of the one before ({starts[index - 1]})"
     for index, error in enumerate(wheels.scale_errors):
         if not -0.5 < error < 0.5:
             yield f"wheels.scale_errors[{index}]", "must lie between -0.5 and 0.5"

@@ -1,6 +1,7 @@
 """The true motion: a script of segments, its smooth kinematics in closed form, and the position by quadrature.
 
-The point on the road below the middle of the rear axle moves along the vehicle's forward axis: there is no side slip.
+The point on the road below the middle of the rear axle moves along the vehicle's forward axis; if the axle slips, it also
+moves out of a bend, by an angle that is proportional to the lateral acceleration.
 Heading and slope are functions of the distance driven, speed is one of time; all pass from value to value by `blend`,
 whose third derivative is still continuous in between, so that rates and accelerations have no steps anywhere.
 """
@@ -69,6 +70,7 @@ class Trajectory:
     def __init__(self, scenario: Scenario) -> None:
         self._script(scenario)
         self.lean = -np.radians(scenario.vehicle.roll_deg_per_mps2)  # rad per m/s^2 to the right
+        self.slip = np.radians(scenario.vehicle.slip_deg_per_mps2)  # rad per m/s^2
         self.lever_v = np.array(scenario.imu.position_m)
         self.mat_vb = euler_matrix(*(np.radians(np.array([angle])) for angle in scenario.imu.mount_deg))[0]
         steps = int(scenario.duration_s * scenario.imu.rate_hz + 1e-6)
@@ -114,10 +116,14 @@ class Trajectory:
             self.lean * (2 * v * dv * bend + v**3 * bend1),
             self.lean * (2 * (dv * dv + v * ddv) * bend + 5 * v * v * dv * bend1 + v**4 * bend2),
         )
-        return self._body(v, dv, bend, (roll, pitch, yaw))
+        slip = (-self.slip * v**3 * bend, -self.slip * (3 * v * v * dv * bend + v**4 * bend1))
+        return self._body(v, dv, bend, slip, (roll, pitch, yaw))
 
-    def _body(self, v: Array, dv: Array, bend: Array, angles: tuple[tuple[Array, Array, Array], ...]) -> Kinematics:
-        """Motion of the IMU from that of the rear axle and the Euler angles with two derivatives each."""
+    def _body(
+        self, v: Array, dv: Array, bend: Array, slip: tuple[Array, Array], angles: tuple[tuple[Array, Array, Array], ...]
+    ) -> Kinematics:
+        """Motion of the IMU from that of the rear axle, forward and to the right, and the Euler angles with two derivatives
+        each."""
         (roll, droll, ddroll), (pitch, dpitch, ddpitch), (yaw, dyaw, ddyaw) = angles
         mat_nv = euler_matrix(roll, pitch, yaw)
         cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
@@ -133,8 +139,10 @@ class Trajectory:
         )
         forward = np.stack([cp * cy, cp * sy, -sp], -1)
         forward1 = np.stack([-dpitch * sp * cy - level * sy, -dpitch * sp * sy + level * cy, -dpitch * cp], -1)
+        sideways, sideways1 = (np.stack([np.zeros_like(v), speed, np.zeros_like(v)], -1) for speed in slip)
         swing = np.cross(rate, self.lever_v)
-        swing1 = np.cross(rate1, self.lever_v) + np.cross(rate, swing)
+        swing1 = np.cross(rate1, self.lever_v) + np.cross(rate, swing + sideways) + sideways1
+        swing = swing + sideways
         return Kinematics(
             speed=v,
             curvature=bend,

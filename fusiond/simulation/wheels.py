@@ -25,17 +25,23 @@ STEERING_RATIO = 15.0  # steering wheel over front wheels
 
 
 def positions_v(scenario: Scenario) -> Array:
-    """Contact points (4, 3) [m] in vehicle axes from the point below the middle of the rear axle."""
+    """Contact points (4, 3) [m] in vehicle axes from the point below the middle of the rear axle; of a skid-steered vehicle
+    from that below the middle of all wheels."""
     base, half = scenario.vehicle.wheelbase_m, scenario.vehicle.track_m / 2
-    return np.array([(base, -half, 0.0), (base, half, 0.0), (0.0, -half, 0.0), (0.0, half, 0.0)])
+    front, rear = (base / 2, -base / 2) if scenario.vehicle.steering == "skid" else (base, 0.0)
+    return np.array([(front, -half, 0.0), (front, half, 0.0), (rear, -half, 0.0), (rear, half, 0.0)])
 
 
 def true_speeds(scenario: Scenario, kinematics: Kinematics) -> Array:
     """Speed (N, 4) [m/s] of each contact point along its rolling direction: rear wheels roll straight ahead, front
-    wheels along the track of their contact point."""
-    place = positions_v(scenario)
+    wheels along the track of their contact point. Those of a skid-steered vehicle all roll straight ahead, and faster on
+    the outside of a bend than the road passes, slower on the inside."""
+    place, body = positions_v(scenario), scenario.vehicle
+    if body.steering == "skid":
+        return np.asarray(kinematics.speed[:, None] - kinematics.yaw_rate[:, None] * place[:, 1] * body.skid)
     forward = kinematics.speed[:, None] - kinematics.yaw_rate[:, None] * place[:, 1]
-    sideways = kinematics.yaw_rate[:, None] * place[:, 0]
+    slip = -np.radians(body.slip_deg_per_mps2) * kinematics.speed**2 * kinematics.yaw_rate
+    sideways = np.where(place[:, 0] > 0, kinematics.yaw_rate[:, None] * place[:, 0] + slip[:, None], 0.0)
     return np.copysign(np.hypot(forward, sideways), forward)
 
 

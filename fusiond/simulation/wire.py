@@ -63,7 +63,8 @@ class GnssMessages:
 
     def events(self) -> Iterator[Received]:
         fixes = self.fixes
-        columns = (fixes.fix_type, fixes.lat, fixes.lon, fixes.alt, fixes.alt_ellipsoid, fixes.vel, fixes.cog)
+        places = (fixes.lat, fixes.lon, fixes.alt, fixes.alt_ellipsoid, fixes.h_acc, fixes.v_acc)
+        columns = (fixes.fix_type, *places, fixes.vel, fixes.cog)
         velocities = 0
         for sequence, (t_us, time_us, fix_type, *fix) in enumerate(
             zip(*(c.tolist() for c in (self.t_receive_us, self.time_us, *columns)), strict=True)
@@ -73,17 +74,17 @@ class GnssMessages:
             if fix_type < FIX_3D:
                 yield Received(f"{GNSS}.position", sequence, *stamp, Invalid("no fix"))
                 continue
-            yield Received(f"{GNSS}.position", sequence, *stamp, self._position(*fix[:4]))
-            yield Received(f"{GNSS}.velocity", velocities, *stamp, self._velocity(*fix[4:]))
+            yield Received(f"{GNSS}.position", sequence, *stamp, self._position(*fix[:6]))
+            yield Received(f"{GNSS}.velocity", velocities, *stamp, self._velocity(*fix[6:]))
             velocities += 1
 
-    def _position(self, lat: int, lon: int, alt: int, alt_ellipsoid: int) -> GnssPosition:
+    def _position(self, lat: int, lon: int, alt: int, alt_ellipsoid: int, h_acc: int, v_acc: int) -> GnssPosition:
         return GnssPosition(
             latitude=math.radians(lat / 1e7),
             longitude=math.radians(lon / 1e7),
             height=(alt_ellipsoid or alt) / 1e3,
-            sigma_horizontal=self.fixes.h_acc / 1e3 or None,
-            sigma_vertical=self.fixes.v_acc / 1e3 or None,
+            sigma_horizontal=h_acc / 1e3 or None,
+            sigma_vertical=v_acc / 1e3 or None,
         )
 
     def _velocity(self, vel: int, cog: int) -> GnssVelocity:

@@ -1,4 +1,4 @@
-"""The trajectory: smooth, with speeds and rates that agree, and a rear axle that does not slip."""
+"""The trajectory: smooth, with speeds and rates that agree, and a rear axle that does not slip unless told to."""
 
 from __future__ import annotations
 
@@ -41,3 +41,17 @@ def test_rear_axle_does_not_slip_sideways() -> None:
     assert np.abs(velocity_v[:, 1:]).max() < 1e-4
     assert velocity_v[:, 0] == pytest.approx(truth.speed, abs=1e-4)
     assert truth.speed.max() == pytest.approx(14) and truth.speed.min() == pytest.approx(-3)
+
+
+def test_the_rear_axle_slips_out_of_a_bend() -> None:
+    lines = "roll_deg_per_mps2 = 0.0\nslip_deg_per_mps2 = 0.5\n"
+    made = scenario(vehicle=lines, imu="position_m = [0.0, 0.0, 0.0]\nrate_hz = 200.0\n")
+    trajectory = Trajectory(made)
+    k = trajectory.kinematics(trajectory.t)
+    velocity_b = np.einsum("nji,nj->ni", k.mat_nb, k.velocity_n)
+    sideways = k.speed**2 * k.curvature  # m/s^2
+    assert np.abs(sideways).max() > 2
+    assert velocity_b[:, 1] == pytest.approx(-np.radians(0.5) * sideways * k.speed, abs=1e-9)
+    assert velocity_b[:, 2] == pytest.approx(0, abs=1e-9)
+    by_difference = np.gradient(k.velocity_n, trajectory.t, axis=0)[1:-1]
+    assert by_difference == pytest.approx(k.acceleration_n[1:-1], abs=2e-3)

@@ -69,3 +69,12 @@ def test_standing_wheels_read_zero_and_unsigned_ones_hide_the_direction() -> Non
     assert (unsigned[:290] == 0).all()
     assert unsigned.min() == 0 and signed[-800:].min() * 0.01 / 3.6 == pytest.approx(-3.2, abs=0.4)
     assert np.array_equal(np.abs(signed), unsigned)
+
+
+def test_wheels_of_a_skid_steered_vehicle_differ_more_than_the_bend_asks_for() -> None:
+    made = scenario(DRIVE, vehicle='steering = "skid"\nskid = 2.0\ntrack_m = 1.0\nwheelbase_m = 0.6\n')
+    kinematics = Trajectory(made).kinematics(np.array([17.0]))
+    ((front_left, front_right, rear_left, rear_right),) = wheels.true_speeds(made, kinematics)
+    assert front_left == rear_left and front_right == rear_right
+    assert front_left - front_right == pytest.approx(2.0 * float(kinematics.yaw_rate[0]))
+    assert wheels.positions_v(made)[:, 0].tolist() == [0.3, 0.3, -0.3, -0.3]
