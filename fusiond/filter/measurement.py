@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.filter import source_health
+from fusiond.filter import gnss_error, source_health
 from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, observe, wheel_speed
@@ -29,6 +29,7 @@ from fusiond.filter.state import (
     LAST_SPEED,
     LOWEST_SPEED,
     NEVER,
+    POSITION,
     POSITION_E,
     RESET_SOURCE,
     T_BACK,
@@ -91,6 +92,9 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     same = source_health.arrive(memory, stamps, values, t_ns)
     remember(memory, model, values)
     seen = Observation(state.size)
+    if model == GNSS_POSITION:
+        gnss_error.carry(state, source, values, params)
+        gnss_error.note(state, source, params)
     if not observe(state, model, values, parameter, seen):
         return False
     m = seen.m
@@ -127,7 +131,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
     row["ratio"] = memory[LAST_RATIO] = ratio
     if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, params):
-        _reset(state, source, seen, int(parameter[RESETS]))
+        _reset(state, source, values, seen, params)
         source_health.begin(memory)
         fused = True
     if fused:
@@ -164,21 +168,24 @@ def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, p
 
 
 @compiled
-def _reset(state: FilterState, source: int, seen: Observation, block: int) -> None:
-    """Put what a source observes where it says; `block` is the first of those error states. A barometer's is its own
-    offset: that is no jump."""
+def _reset(state: FilterState, source: int, values: Vector, seen: Observation, params: Parameters) -> None:
+    """Put what a source observes where it says. A barometer's is its own offset: that is no jump."""
+    block = int(params.model_parameters[source, RESETS])
     if block == HEIGHT_OFFSET_ERROR.start:
         _reset_offset(state, seen)
         return
-    _reset_block(state, seen, block)
+    if block == POSITION.start:
+        gnss_error.place(state, source, values, seen, params)
+    else:
+        _reset_block(state, seen, block)
     count_reset(state, ResetReason.SOURCE_RETURNED)
     state.stamps[RESET_SOURCE] = source
 
 
 @compiled
 def _reset_block(state: FilterState, seen: Observation, block: int) -> None:  # noqa: PLR0912 - loops
-    """Put position or velocity, which begin at `block` in the error state as in the nominal one, where the receiver says,
-    with the receiver's uncertainty."""
+    """Put the velocity, which begins at `block` in the error state as in the nominal one, where the receiver says, with the
+    receiver's uncertainty."""
     x, p, m = state.nominal, state.covariance, seen.m
     to_n = mat_ne(x[POSITION_E])
     half, spread = np.zeros((3, 3)), np.zeros((3, 3))

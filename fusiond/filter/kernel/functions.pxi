@@ -376,6 +376,90 @@ cdef void wgs84_gravity_e(double* position_e, double* out) noexcept nogil:
     out[2] = ((-g) * sin_lat)
     return
 
+# ---------------- fusiond.filter.gnss_error
+
+cdef void gnss_error_carry(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    cdef double* parameter
+    cdef double* x
+    cdef double* p
+    cdef double kept
+    cdef int64_t i
+    cdef int _i
+    cdef double factor
+    cdef double new
+    cdef double to_n[3 * 3]
+    cdef double horizontal
+    cdef double vertical
+    parameter = params.model_parameters + (source) * PARAMETERS
+    x = state.nominal
+    p = state.covariance
+    if (not (parameter[5] > 0)):
+        return
+    kept = 0.0
+    if (state.stamps[5] != (<int64_t>-4611686018427387904)):
+        kept = portable_exp(((-((state.stamps[0] - state.stamps[5]) * 1e-09)) / parameter[5]))
+    for i in range(3):
+        x[(19 + i)] *= kept
+        for _i in range(n):
+            (p + ((18 + i)) * n)[_i] *= kept
+    for i in range(3):
+        for _i in range(n):
+            (p + (18 + i))[_i * n] *= kept
+    factor = source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9])
+    new = ((factor * gnss_position_slow_share(parameter)) * (1 - (kept * kept)))
+    wgs84_mat_ne(x, to_n)
+    horizontal, vertical = (new * values[3]), (new * values[4])
+    gnss_error__add(p, 18, to_n, horizontal, horizontal, vertical)
+
+cdef void gnss_error_note(State* state, int64_t source, Parameters* params) noexcept nogil:
+    if (params.model_parameters[(source) * PARAMETERS + 5] > 0):
+        state.stamps[5] = state.stamps[0]
+
+cdef void gnss_error_place(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef double to_n[3 * 3]
+    cdef bint slow
+    cdef int _i
+    cdef double _t1[3]
+    cdef int64_t i
+    cdef int64_t j
+    cdef double variance
+    x = state.nominal
+    p = state.covariance
+    wgs84_mat_ne(x, to_n)
+    slow = (params.model_parameters[(source) * PARAMETERS + 5] > 0)
+    if slow:
+        for _i in range(3):
+            x[_i] += (x + 19)[_i]
+        state.stamps[5] = (<int64_t>-4611686018427387904)
+        gnss_error_carry(state, source, values, params)
+    rotation_transposed_times(to_n, seen.innovation, _t1)
+    for _i in range(3):
+        x[_i] += _t1[_i]
+    for i in range(3):
+        for _i in range(n):
+            (p + ((0 + i)) * n)[_i] = 0.0
+        for _i in range(n):
+            (p + (0 + i))[_i * n] = 0.0
+    gnss_error__add(p, 0, to_n, seen.variance[0], seen.variance[1], seen.variance[2])
+    if (not slow):
+        return
+    gnss_error_note(state, source, params)
+    for i in range(3):
+        for j in range(3):
+            variance = p[((18 + i)) * n + (18 + j)]
+            p[((0 + i)) * n + (0 + j)] += variance
+            p[((0 + i)) * n + (18 + j)] = (-variance)
+            p[((18 + i)) * n + (0 + j)] = (-variance)
+
+cdef void gnss_error__add(double* p, int64_t block, double* to_n, double north, double east, double down) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t j
+    for i in range(3):
+        for j in range(3):
+            p[((block + i)) * n + (block + j)] += (((north * (to_n[(0) * 3 + i] * to_n[(0) * 3 + j])) + (east * (to_n[(1) * 3 + i] * to_n[(1) * 3 + j]))) + (down * (to_n[(2) * 3 + i] * to_n[(2) * 3 + j])))
+
 # ---------------- fusiond.filter.heading_bank
 
 cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double factor, double* spread) noexcept nogil:
@@ -586,8 +670,8 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     measurement_update_inject(state, mean)
     for _i in range(HYPOTHESES * BLOCK):
         state.bank[_i] = 0.0
-    state.stamps[9] = 2
-    if (state.stamps[20] == 1):
+    state.stamps[10] = 2
+    if (state.stamps[21] == 1):
         state_count_reset(state, 5)
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
@@ -629,13 +713,13 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
     if (still and (not (initial_alignment__gnss_speed(state) >= params.course_speed))):
         for _i in range(3):
             (a + 21)[_i] = (a + 15)[_i]
-        stamps[7] = t_ns
+        stamps[8] = t_ns
 
 cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
     cdef int64_t first
     cdef double north
     cdef double east
-    first = state.stamps[5]
+    first = state.stamps[6]
     if ((first == (<int64_t>-4611686018427387904)) or ((state.stamps[0] - first) > (<int64_t>3000000000))):
         return NAN
     north, east = state.auxiliary[24], state.auxiliary[(24 + 1)]
@@ -702,6 +786,9 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     elapsed = source_health_since_last(stamps, t_ns)
     same = source_health_arrive(memory, stamps, values, t_ns)
     measurement_remember(memory, model, values)
+    if (model == 0):
+        gnss_error_carry(state, source, values, params)
+        gnss_error_note(state, source, params)
     if (not observations_observe(state, model, values, parameter, &seen)):
         return False
     m = seen.m
@@ -739,7 +826,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     row.ratio = _t2
     memory[2] = _t2
     if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, params)):
-        measurement__reset(state, source, &seen, (<int64_t>(parameter[13])))
+        measurement__reset(state, source, values, &seen, params)
         source_health_begin(memory)
         fused = True
     if fused:
@@ -775,13 +862,18 @@ cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Ob
         wait = (6 * wait)
     return ((t_ns - stamps[4]) >= wait)
 
-cdef void measurement__reset(State* state, int64_t source, Observation* seen, int64_t block) noexcept nogil:
-    if (block == 26):
+cdef void measurement__reset(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
+    cdef int64_t block
+    block = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 13]))
+    if (block == 29):
         measurement__reset_offset(state, seen)
         return
-    measurement__reset_block(state, seen, block)
+    if (block == 0):
+        gnss_error_place(state, source, values, seen, params)
+    else:
+        measurement__reset_block(state, seen, block)
     state_count_reset(state, 4)
-    state.stamps[19] = source
+    state.stamps[20] = source
 
 cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
     cdef double* x
@@ -838,8 +930,8 @@ cdef void measurement__reset_offset(State* state, Observation* seen) noexcept no
     cdef int64_t k
     cdef double variance
     p = state.covariance
-    offset = 26
-    state.nominal[27] += seen.innovation[0]
+    offset = 29
+    state.nominal[30] += seen.innovation[0]
     for _i in range(n):
         (p + (offset) * n)[_i] = 0.0
     for _i in range(n):
@@ -1149,7 +1241,7 @@ cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b
     auxiliary = state.auxiliary
     smooth = ((1 - portable_exp(((-dt) / 0.08))) if (auxiliary[20] > 0) else 1.0)
     for _i in range(3):
-        (auxiliary + 36)[_i] += (smooth * (force_b[_i] - (auxiliary + 36)[_i]))
+        (auxiliary + 37)[_i] += (smooth * (force_b[_i] - (auxiliary + 37)[_i]))
     share = (1 - portable_exp(((-dt) / 0.5)))
     weight = (auxiliary[20] + (share * (1 - auxiliary[20])))
     auxiliary[20] = weight
@@ -1269,11 +1361,11 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* par
     _t1 = measurement_update_update(state, &seen, params.gates[seen.m], factor, True, 0.0)
     ratio = _t1[0]
     fused = _t1[1]
-    state.auxiliary[(32 + which)] = ratio
+    state.auxiliary[(33 + which)] = ratio
     if fused:
-        state.stamps[(11 + which)] += 1
+        state.stamps[(12 + which)] += 1
     else:
-        state.stamps[(14 + which)] += 1
+        state.stamps[(15 + which)] += 1
     return fused
 
 # ---------------- fusiond.filter.north_east_down
@@ -1346,16 +1438,19 @@ cdef bint barometric_height_observe(State* state, double* row, double* parameter
     model_begin(seen, 1)
     for _i in range(3):
         (seen.jacobian + (0) * n)[_i] = (-(to_n + (2) * 3)[_i])
-    seen.jacobian[(0) * n + 26] = 1.0
+    seen.jacobian[(0) * n + 29] = 1.0
     _t1 = wgs84_geodetic(x)
     _ = _t1[0]
     _ = _t1[1]
     height = _t1[2]
-    seen.innovation[0] = ((row[0] - height) - x[27])
+    seen.innovation[0] = ((row[0] - height) - x[30])
     seen.variance[0] = row[1]
     return True
 
 # ---------------- fusiond.filter.observations.gnss_position
+
+cdef double gnss_position_slow_share(double* parameter) noexcept nogil:
+    return ((1 - 0.2) if (parameter[5] > 0) else 0.0)
 
 cdef bint gnss_position_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double* x
@@ -1368,6 +1463,7 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     cdef double _t3[3 * 3]
     cdef int64_t i
     cdef double off_e[3]
+    cdef double slow
     cdef double _t4[3]
     cdef double _t5
     x = state.nominal
@@ -1375,7 +1471,7 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_begin(seen, 3)
     delay = 0.0
     if (parameter[4] != 0.0):
-        delay = x[25]
+        delay = x[28]
         gnss_position__calibrated(state, parameter, to_n, seen, _t1)
         for _i in range(3):
             lever_e[_i] = _t1[_i]
@@ -1390,13 +1486,20 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
     for _i in range(3):
         off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
+    slow = gnss_position_slow_share(parameter)
+    if (slow > 0):
+        for _i in range(3):
+            off_e[_i] -= (x + 19)[_i]
+        for i in range(3):
+            for _i in range(3):
+                (seen.jacobian + (i) * n + 18)[_i] = (to_n + (i) * 3)[_i]
     rotation_times(to_n, off_e, _t4)
     for _i in range(3):
         seen.innovation[_i] = _t4[_i]
-    _t5 = row[3]
+    _t5 = ((1 - slow) * row[3])
     seen.variance[0] = _t5
     seen.variance[1] = _t5
-    seen.variance[2] = row[4]
+    seen.variance[2] = ((1 - slow) * row[4])
     return True
 
 cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n, Observation* seen, double* out) noexcept nogil:
@@ -1415,22 +1518,22 @@ cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n,
     cdef double _t3[3]
     x = state.nominal
     model_mat_eb(state, rotation)
-    delay = x[25]
+    delay = x[28]
     for _i in range(3):
-        arm_b[_i] = (lever_b[_i] + (x + 22)[_i])
+        arm_b[_i] = (lever_b[_i] + (x + 25)[_i])
     model_rate_b(state, _t1)
     rotation_cross(_t1, arm_b, swing_b)
     rotation_matrix_product(to_n, rotation, turned)
     model_skew_rows(turned, arm_b, (-delay), 3, seen.jacobian, 9)
     model_mean_rate_b(state, _t2)
-    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 21)
+    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 24)
     for i in range(3):
         along = 0.0
         for j in range(3):
             seen.jacobian[(i) * n + (3 + j)] = (to_n[(i) * 3 + j] * (-delay))
-            seen.jacobian[(i) * n + (21 + j)] += turned[(i) * 3 + j]
+            seen.jacobian[(i) * n + (24 + j)] += turned[(i) * 3 + j]
             along += ((to_n[(i) * 3 + j] * x[(3 + j)]) + (turned[(i) * 3 + j] * swing_b[j]))
-        seen.jacobian[(i) * n + 24] = (-along)
+        seen.jacobian[(i) * n + 27] = (-along)
     for _i in range(3):
         _t3[_i] = (arm_b[_i] - (swing_b[_i] * delay))
     rotation_times(rotation, _t3, out)
@@ -1464,7 +1567,7 @@ cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Ob
         arm_b[_i] = parameter[_i]
     if (parameter[4] != 0.0):
         for _i in range(3):
-            arm_b[_i] += (x + 22)[_i]
+            arm_b[_i] += (x + 25)[_i]
     model_rate_b(state, _t2)
     rotation_cross(_t2, arm_b, _t1)
     rotation_times(rotation, _t1, swing_e)
@@ -1503,24 +1606,24 @@ cdef void gnss_velocity__gained(State* state, double* to_n, double* turned, Obse
     cdef double along
     cdef int64_t j
     x = state.nominal
-    delay = (x[25] + x[(25 + 1)])
+    delay = (x[28] + x[(28 + 1)])
     model_mat_eb(state, _t1)
     for _i in range(3):
-        _t2[_i] = ((state.auxiliary + 36)[_i] - (x + 13)[_i])
+        _t2[_i] = ((state.auxiliary + 37)[_i] - (x + 13)[_i])
     rotation_times(_t1, _t2, force_e)
     wgs84_gravity_e(x, rest_e)
     rest_e[0] += ((2 * 7.292115e-05) * x[(3 + 1)])
     rest_e[1] -= ((2 * 7.292115e-05) * x[3])
     model_mean_rate_b(state, _t3)
-    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 21)
+    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 24)
     model_skew_rows(to_n, rest_e, (-delay), seen.m, seen.jacobian, 6)
     for i in range(seen.m):
         along = 0.0
         for j in range(3):
             along += (to_n[(i) * 3 + j] * (force_e[j] + rest_e[j]))
             seen.jacobian[(i) * n + (12 + j)] = (turned[(i) * 3 + j] * delay)
-        seen.jacobian[(i) * n + 24] = (-along)
-        seen.jacobian[(i) * n + (24 + 1)] = (-along)
+        seen.jacobian[(i) * n + 27] = (-along)
+        seen.jacobian[(i) * n + (27 + 1)] = (-along)
         seen.jacobian[(i) * n + 3] += (to_n[(i) * 3 + 1] * ((2 * 7.292115e-05) * delay))
         seen.jacobian[(i) * n + (3 + 1)] -= (to_n[(i) * 3 + 0] * ((2 * 7.292115e-05) * delay))
     for _i in range(3):
@@ -1581,7 +1684,7 @@ cdef void model_with_rate_noise(State* state, Observation* seen) noexcept nogil:
     cdef double* by
     for a in range(seen.m):
         by = seen.jacobian + (a) * n + 9
-        seen.variance[a] += (state.auxiliary[35] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
+        seen.variance[a] += (state.auxiliary[36] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
 
 cdef void model_mean_rate_b(State* state, double* out) noexcept nogil:
     cdef int _i
@@ -2030,8 +2133,8 @@ cdef bint state_is_finite(State* state) noexcept nogil:
     return isfinite(total)
 
 cdef void state_count_reset(State* state, int64_t reason) noexcept nogil:
-    state.stamps[10] += 1
-    state.stamps[18] = reason
+    state.stamps[11] += 1
+    state.stamps[19] = reason
 
 # ---------------- fusiond.filter.step
 
@@ -2047,9 +2150,9 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
         row.outcome = 3
         return
     row.outcome = 0
-    if (state.stamps[9] == 1):
+    if (state.stamps[10] == 1):
         initial_alignment_gather_motion(state, row, params)
-    elif (state.stamps[9] == 3):
+    elif (state.stamps[10] == 3):
         step__choose(state, row, imu, params)
         step_guard(state)
     else:
@@ -2073,7 +2176,7 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
     cdef int64_t model
     cdef double grown
     stamps = state.stamps
-    phase = (<int64_t>(state.stamps[9]))
+    phase = (<int64_t>(state.stamps[10]))
     t_ns, model = (<int64_t>row.t_ns), (<int64_t>(params.models[(<int64_t>row.source)]))
     if ((phase == 0) or ((t_ns - stamps[0]) > params.restart_gap_ns)):
         return False
@@ -2156,7 +2259,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     frozen = (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE))
     if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > params.imu_gap_ns) or frozen):
         strapdown_coast(state, dt, &params.noise, motion_constraints_rests(state, params))
-        a[35] = (0.5 * 0.5)
+        a[36] = (0.5 * 0.5)
         return
     sample = imu.values
     span = (<double>((imu.t_ns - held)))
@@ -2174,7 +2277,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
         (a + 6)[_i] = (a[_i] + (end * force_change[_i]))
     for _i in range(3):
         (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
-    a[35] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
+    a[36] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
     strapdown_propagate(state, dt, force_b, rate_b, &params.noise)
 
 cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
@@ -2187,7 +2290,7 @@ cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept 
     stamps = state.stamps
     a = state.auxiliary
     begin = (<int64_t>(stamps[0]))
-    if ((t_ns <= begin) or (stamps[9] != 2)):
+    if ((t_ns <= begin) or (stamps[10] != 2)):
         return
     _t1 = (<int64_t>((stamps[1] + params.imu_gap_ns)))
     _t2 = (_t1 if _t1 < t_ns else t_ns)
@@ -2240,9 +2343,13 @@ cdef void step__choose(State* state, Row* row, Row* imu, Parameters* params) noe
     factor = measurement_factor_of(own, model, values, parameter, t_ns)
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
+            if (model == 0):
+                hypothesis = hypothesis_of(state, i)
+                gnss_error_carry(&hypothesis, source, values, params)
             heading_bank_fuse_measurement(state, i, model, values, parameter, factor, params)
     own[1] = t_ns
     if (model == 0):
+        gnss_error_note(state, source, params)
         stamps[4] = t_ns
     heading_bank_collapse_if_close(state, params)
 
@@ -2263,7 +2370,7 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     same = source_health_arrive(memory, own, row.values, t_ns)
     source_health_judge_repetition(memory, own, same, t_ns)
     step_hold(state, row.values, t_ns)
-    a[35] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
+    a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
@@ -2285,15 +2392,15 @@ cdef void step_guard(State* state) noexcept nogil:
     cdef int64_t i
     cdef int64_t resets
     cdef int64_t blown
-    if (state.stamps[9] == 3):
+    if (state.stamps[10] == 3):
         for i in range(13):
             if (state.bank[(i) * BLOCK + 0] > 0):
                 return
     elif state_is_finite(state):
         return
-    resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
+    resets, blown = (<int64_t>(state.stamps[11])), (<int64_t>(state.stamps[18]))
     clear_state(state)
-    state.stamps[10], state.stamps[17] = resets, (blown + 1)
+    state.stamps[11], state.stamps[18] = resets, (blown + 1)
     state_count_reset(state, 3)
 
 cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int64_t source, int64_t sequence) noexcept nogil:
