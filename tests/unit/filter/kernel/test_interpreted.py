@@ -324,7 +324,7 @@ def test_sizes() -> None:
     with pytest.raises(ValueError, match="numbers"):
         kernel.predict(FilterState(2), T0)
     with pytest.raises(ValueError, match="21 error states is needed, not 30"):
-        kernel.to_north_east_down(np.zeros(NOMINAL_SIZE), np.zeros((27, 27)))
+        kernel.to_north_east_down(np.zeros(NOMINAL_SIZE), np.zeros((30, 30)))
     assert compiled_available()
     assert isinstance(make_kernel(make_parameters(config()), False), Kernel)
     assert not isinstance(make_kernel(make_parameters(config())), Kernel)
