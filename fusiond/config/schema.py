@@ -162,8 +162,8 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and a lower bound to what it gives
     height_sigma_m: Positive = 3.0  # the same, vertical
     velocity_sigma_mps: Positive = 0.2  # the same for the velocity, per axis
-    position_correlation_s: NotNegative = 0.0  # correlation time of position errors: dense fixes weigh less
-    velocity_correlation_s: NotNegative = 0.0  # correlation time of velocity errors
+    position_correlation_s: NotNegative = 30.0  # correlation time of the position's slow errors, four fifths of its variance
+    velocity_correlation_s: NotNegative = 2.0  # correlation time of velocity errors: dense ones weigh less
     use_velocity: bool = True  # fuse speed and course as well
     outliers: Literal["gate", "mixture"] = "gate"  # reject them, or weight each fix by its likelihood of being one
     outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, with outliers = "mixture"
@@ -181,7 +181,6 @@ class Gnss(Sensor, frozen=True, kw_only=True):
             GnssPosition,
             self.delay_ms,
             suffix=".position",
-            correlation_s=self.position_correlation_s,
             sigma=self.position_sigma_m,
             group=self.group,
             shared_sigma=self.shared_sigma_m,

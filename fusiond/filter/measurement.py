@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.filter import rivals, source_health
+from fusiond.filter import gnss_error, rivals, source_health
 from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried
-from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, observe, wheel_speed
+from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, gnss_position, observe, wheel_speed
 from fusiond.filter.observations.gnss_velocity import lowest_speed
 from fusiond.filter.observations.model import (
     CLUTTER,
@@ -32,6 +32,7 @@ from fusiond.filter.state import (
     LAST_SPEED,
     LOWEST_SPEED,
     NEVER,
+    POSITION,
     POSITION_E,
     STATE_DOUBT,
     SUSPECT,
@@ -79,6 +80,18 @@ def correlation_of(model: int, values: Vector, parameter: Vector) -> float:
 
 
 @compiled
+def _carry_error(state: FilterState, source: int, values: Vector, params: Parameters) -> None:
+    """Carry the slow error of positions to a fix, in the state and in its rivals."""
+    gnss_error.carry(state, source, values, params)
+    if state.stamps[ALIVE] > 0:
+        for slot in range(rivals.RIVALS):
+            if state.bank[slot, 0] > 0:
+                rival = state.hypothesis(slot)
+                gnss_error.carry(rival, source, values, params)
+    gnss_error.note(state, source, params)
+
+
+@compiled
 def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
@@ -88,6 +101,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     same = source_health.arrive(memory, stamps, values, t_ns)
     remember(memory, model, values)
     seen = Observation(state.size)
+    if model == GNSS_POSITION:
+        _carry_error(state, source, values, params)
     if not observe(state, model, values, parameter, seen):
         return False
     m = seen.m
@@ -109,9 +124,16 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     doubtful = disputed(state, source if model == GNSS_VELOCITY else int(parameter[COMPANION]), params)
     before = source_health.odds_of_bias(memory)
     if not doubtful:
-        whitened = np.empty(3)
-        if whiten(spread, seen.innovation, learnt, m, whitened):
-            _judge(state, source, whitened, m, same, t_ns, correlation_of(model, values, parameter), params)
+        whitened, lasting = np.empty(3), correlation_of(model, values, parameter)
+        judged, wider = seen.innovation.copy(), np.empty((3, 3))
+        for a in range(m):
+            for b in range(m):
+                wider[a, b] = spread[a, b]
+        if model == GNSS_POSITION:
+            lasting = parameter[gnss_position.ERROR_TIME]
+            gnss_error.with_whole_error(state, source, values, params, judged, wider)
+        if whiten(wider, judged, learnt, m, whitened):
+            _judge(state, source, whitened, m, same, t_ns, lasting, params)
         source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = source_health.is_used(memory, by_rivals)
     if model == WHEEL_SPEED and trusted:
@@ -129,7 +151,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if by_rivals and not doubtful:
         rivals.suspect_receiver(state, source, before, params)
         if model == GNSS_POSITION and not fused:
-            _suspect_state(state, source, seen, params)
+            _suspect_state(state, source, values, seen, params)
     if trusted and heard:
         rivals.watch_inertial(state, seen, weight, spread, fits)
     if state.stamps[ALIVE] > 0:
@@ -207,7 +229,7 @@ def _fuse_rivals(
 
 
 @compiled
-def _suspect_state(state: FilterState, source: int, seen: Observation, params: Parameters) -> None:
+def _suspect_state(state: FilterState, source: int, values: Vector, seen: Observation, params: Parameters) -> None:
     """Where a receiver that is called a liar may be right all the same, as likely as the state is wrong, begin the rival that
     is where it says."""
     odds = state.bank[rivals.RECEIVER, 0]
@@ -219,42 +241,7 @@ def _suspect_state(state: FilterState, source: int, seen: Observation, params: P
         return
     rivals.open_slot(state, rivals.RETURN, odds)
     rival = state.hypothesis(rivals.RETURN)
-    _reset_block(rival, seen, int(params.model_parameters[source, RESETS]))
-
-
-@compiled
-def _reset_block(state: FilterState, seen: Observation, block: int) -> None:  # noqa: PLR0912 - loops
-    """Put position or velocity, which begin at `block` in the error state as in the nominal one, where the receiver says,
-    with the receiver's uncertainty."""
-    x, p, m = state.nominal, state.covariance, seen.m
-    to_n = mat_ne(x[POSITION_E])
-    half, spread = np.zeros((3, 3)), np.zeros((3, 3))
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                half[i, j] += to_n[i, k] * p[block + k, block + j]
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                spread[i, j] += half[i, k] * to_n[j, k]
-    for i in range(3):
-        for j in range(3):
-            if i < m or j < m:
-                spread[i, j] = seen.variance[i] if i == j else 0.0
-    for i in range(3):
-        for k in range(m):
-            x[block + i] += to_n[k, i] * seen.innovation[k]
-        p[block + i] = 0.0
-        p[:, block + i] = 0.0
-        half[i] = 0.0
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                half[i, j] += to_n[k, i] * spread[k, j]
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                p[block + i, block + j] += half[i, k] * to_n[k, j]
+    gnss_error.place(rival, source, values, seen, params)
 
 
 @compiled

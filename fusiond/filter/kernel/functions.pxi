@@ -376,6 +376,119 @@ cdef void wgs84_gravity_e(double* position_e, double* out) noexcept nogil:
     out[2] = ((-g) * sin_lat)
     return
 
+# ---------------- fusiond.filter.gnss_error
+
+cdef void gnss_error_carry(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    cdef double* parameter
+    cdef double* x
+    cdef double* p
+    cdef double kept
+    cdef int64_t i
+    cdef int _i
+    cdef double factor
+    cdef double new
+    cdef double to_n[3 * 3]
+    cdef double horizontal
+    cdef double vertical
+    parameter = params.model_parameters + (source) * PARAMETERS
+    x = state.nominal
+    p = state.covariance
+    if (not (parameter[5] > 0)):
+        return
+    kept = 0.0
+    if (state.stamps[5] != (<int64_t>-4611686018427387904)):
+        kept = portable_exp(((-((state.stamps[0] - state.stamps[5]) * 1e-09)) / parameter[5]))
+    for i in range(3):
+        x[(19 + i)] *= kept
+        for _i in range(n):
+            (p + ((18 + i)) * n)[_i] *= kept
+    for i in range(3):
+        for _i in range(n):
+            (p + (18 + i))[_i * n] *= kept
+    factor = source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9])
+    new = ((factor * gnss_position_slow_share(parameter)) * (1 - (kept * kept)))
+    wgs84_mat_ne(x, to_n)
+    horizontal, vertical = (new * values[3]), (new * values[4])
+    gnss_error__add(p, 18, to_n, horizontal, horizontal, vertical)
+
+cdef void gnss_error_note(State* state, int64_t source, Parameters* params) noexcept nogil:
+    if (params.model_parameters[(source) * PARAMETERS + 5] > 0):
+        state.stamps[5] = state.stamps[0]
+
+cdef void gnss_error_with_whole_error(State* state, int64_t source, double* values, Parameters* params, double* innovation, double* spread) noexcept nogil:
+    cdef double* parameter
+    cdef double* p
+    cdef double to_n[3 * 3]
+    cdef double share
+    cdef double error_n[3]
+    cdef int64_t i
+    cdef double own
+    cdef int64_t j
+    cdef int64_t k
+    cdef double variance
+    cdef double _t1
+    parameter = params.model_parameters + (source) * PARAMETERS
+    p = state.covariance
+    if (not (parameter[5] > 0)):
+        return
+    wgs84_mat_ne(state.nominal, to_n)
+    share = (source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9]) * gnss_position_slow_share(parameter))
+    rotation_times(to_n, state.nominal + 19, error_n)
+    for i in range(3):
+        innovation[i] += error_n[i]
+        own = 0.0
+        for j in range(3):
+            for k in range(3):
+                own += ((to_n[(i) * 3 + j] * p[((18 + j)) * n + (18 + k)]) * to_n[(i) * 3 + k])
+        variance = (share * (values[4] if (i == 2) else values[3]))
+        _t1 = (variance - own)
+        spread[(i) * 3 + i] += (0.0 if 0.0 > _t1 else _t1)
+
+cdef void gnss_error_place(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef double to_n[3 * 3]
+    cdef bint slow
+    cdef int _i
+    cdef double _t1[3]
+    cdef int64_t i
+    cdef int64_t j
+    cdef double variance
+    x = state.nominal
+    p = state.covariance
+    wgs84_mat_ne(x, to_n)
+    slow = (params.model_parameters[(source) * PARAMETERS + 5] > 0)
+    if slow:
+        for _i in range(3):
+            x[_i] += (x + 19)[_i]
+        state.stamps[5] = (<int64_t>-4611686018427387904)
+        gnss_error_carry(state, source, values, params)
+    rotation_transposed_times(to_n, seen.innovation, _t1)
+    for _i in range(3):
+        x[_i] += _t1[_i]
+    for i in range(3):
+        for _i in range(n):
+            (p + ((0 + i)) * n)[_i] = 0.0
+        for _i in range(n):
+            (p + (0 + i))[_i * n] = 0.0
+    gnss_error__add(p, 0, to_n, seen.variance[0], seen.variance[1], seen.variance[2])
+    if (not slow):
+        return
+    gnss_error_note(state, source, params)
+    for i in range(3):
+        for j in range(3):
+            variance = p[((18 + i)) * n + (18 + j)]
+            p[((0 + i)) * n + (0 + j)] += variance
+            p[((0 + i)) * n + (18 + j)] = (-variance)
+            p[((18 + i)) * n + (0 + j)] = (-variance)
+
+cdef void gnss_error__add(double* p, int64_t block, double* to_n, double north, double east, double down) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t j
+    for i in range(3):
+        for j in range(3):
+            p[((block + i)) * n + (block + j)] += (((north * (to_n[(0) * 3 + i] * to_n[(0) * 3 + j])) + (east * (to_n[(1) * 3 + i] * to_n[(1) * 3 + j]))) + (down * (to_n[(2) * 3 + i] * to_n[(2) * 3 + j])))
+
 # ---------------- fusiond.filter.heading_bank
 
 cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double factor, double* spread) noexcept nogil:
@@ -586,8 +699,8 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     measurement_update_inject(state, mean)
     for _i in range(HYPOTHESES * BLOCK):
         state.bank[_i] = 0.0
-    state.stamps[9] = 2
-    if (state.stamps[20] == 1):
+    state.stamps[10] = 2
+    if (state.stamps[21] == 1):
         state_count_reset(state, 5)
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
@@ -629,13 +742,13 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
     if (still and (not (initial_alignment__gnss_speed(state) >= params.course_speed))):
         for _i in range(3):
             (a + 21)[_i] = (a + 15)[_i]
-        stamps[7] = t_ns
+        stamps[8] = t_ns
 
 cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
     cdef int64_t first
     cdef double north
     cdef double east
-    first = state.stamps[5]
+    first = state.stamps[6]
     if ((first == (<int64_t>-4611686018427387904)) or ((state.stamps[0] - first) > (<int64_t>3000000000))):
         return NAN
     north, east = state.auxiliary[24], state.auxiliary[(24 + 1)]
@@ -663,6 +776,17 @@ cdef double measurement_factor_of(int64_t* stamps, int64_t model, double* values
 cdef double measurement_correlation_of(int64_t model, double* values, double* parameter) noexcept nogil:
     return (values[2] if (model == 2) else parameter[3])
 
+cdef void measurement__carry_error(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    cdef int64_t slot
+    cdef State rival
+    gnss_error_carry(state, source, values, params)
+    if (state.stamps[22] > 0):
+        for slot in range(4):
+            if (state.bank[(slot) * BLOCK + 0] > 0):
+                rival = hypothesis_of(state, slot)
+                gnss_error_carry(&rival, source, values, params)
+    gnss_error_note(state, source, params)
+
 cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef int64_t source
     cdef int64_t t_ns
@@ -686,6 +810,11 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef bint doubtful
     cdef double before
     cdef double whitened[3]
+    cdef double lasting
+    cdef double judged[3]
+    cdef int _i
+    cdef double wider[3 * 3]
+    cdef int64_t b
     cdef bint trusted
     cdef double noisy
     cdef bint heard
@@ -704,6 +833,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     elapsed = source_health_since_last(stamps, t_ns)
     same = source_health_arrive(memory, stamps, values, t_ns)
     measurement_remember(memory, model, values)
+    if (model == 0):
+        measurement__carry_error(state, source, values, params)
     if (not observations_observe(state, model, values, parameter, &seen)):
         return False
     m = seen.m
@@ -723,8 +854,17 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     doubtful = motion_constraints_disputed(state, (source if (model == 1) else (<int64_t>(parameter[11]))), params)
     before = source_health_odds_of_bias(memory)
     if (not doubtful):
-        if measurement_update_whiten(spread, seen.innovation, learnt, m, whitened):
-            measurement__judge(state, source, whitened, m, same, t_ns, measurement_correlation_of(model, values, parameter), params)
+        lasting = measurement_correlation_of(model, values, parameter)
+        for _i in range(3):
+            judged[_i] = seen.innovation[_i]
+        for a in range(m):
+            for b in range(m):
+                wider[(a) * 3 + b] = spread[(a) * 3 + b]
+        if (model == 0):
+            lasting = parameter[5]
+            gnss_error_with_whole_error(state, source, values, params, judged, wider)
+        if measurement_update_whiten(wider, judged, learnt, m, whitened):
+            measurement__judge(state, source, whitened, m, same, t_ns, lasting, params)
         source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = source_health_is_used(memory, by_rivals)
     if ((model == 2) and trusted):
@@ -740,18 +880,18 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     _t2 = ratio
     row.ratio = _t2
     memory[2] = _t2
-    if ((state.stamps[21] > 0) and heard):
+    if ((state.stamps[22] > 0) and heard):
         main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
         measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, params)
     if (by_rivals and (not doubtful)):
         rivals_suspect_receiver(state, source, before, params)
         if ((model == 0) and (not fused)):
-            measurement__suspect_state(state, source, &seen, params)
+            measurement__suspect_state(state, source, values, &seen, params)
     if (trusted and heard):
         rivals_watch_inertial(state, &seen, weight, spread, fits)
-    if (state.stamps[21] > 0):
+    if (state.stamps[22] > 0):
         rivals_decide(state, params)
-    if ((not fused) and ((<int64_t>(parameter[13])) == 26) and (memory[6] > 0.5)):
+    if ((not fused) and ((<int64_t>(parameter[13])) == 29) and (memory[6] > 0.5)):
         measurement__reset_offset(state, &seen)
         source_health_begin(memory)
         fused = True
@@ -760,7 +900,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
-            state.auxiliary[40] = 0.0
+            state.auxiliary[41] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     return fused
@@ -784,7 +924,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
             memory[18] = 0.0
             source_health_begin(memory)
         return
-    if ((not gnss) and (state.stamps[21] > 0)):
+    if ((not gnss) and (state.stamps[22] > 0)):
         return
     if source_health_is_due(stamps, t_ns, correlation):
         source_health_judge(memory, stamps, whitened, m, same, t_ns)
@@ -820,12 +960,12 @@ cdef void measurement__fuse_rivals(State* state, int64_t source, double* values,
             rivals_weigh(state, slot, own, main)
             measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
 
-cdef void measurement__suspect_state(State* state, int64_t source, Observation* seen, Parameters* params) noexcept nogil:
+cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
     cdef double odds
     cdef double wrong
     cdef State rival
     odds = state.bank[(1) * BLOCK + 0]
-    if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[22] != source)):
+    if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[23] != source)):
         return
     wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
     odds *= ((wrong / (1 - wrong)) / 0.001)
@@ -833,54 +973,7 @@ cdef void measurement__suspect_state(State* state, int64_t source, Observation* 
         return
     rivals_open_slot(state, 2, odds)
     rival = hypothesis_of(state, 2)
-    measurement__reset_block(&rival, seen, (<int64_t>(params.model_parameters[(source) * PARAMETERS + 13])))
-
-cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
-    cdef double* x
-    cdef double* p
-    cdef int64_t m
-    cdef double to_n[3 * 3]
-    cdef double half[3 * 3]
-    cdef double spread[3 * 3]
-    cdef int64_t i
-    cdef int64_t k
-    cdef int64_t j
-    cdef int _i
-    x = state.nominal
-    p = state.covariance
-    m = seen.m
-    wgs84_mat_ne(x, to_n)
-    memset(half, 0, 3 * 3 * sizeof(double))
-    memset(spread, 0, 3 * 3 * sizeof(double))
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                half[(i) * 3 + j] += (to_n[(i) * 3 + k] * p[((block + k)) * n + (block + j)])
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                spread[(i) * 3 + j] += (half[(i) * 3 + k] * to_n[(j) * 3 + k])
-    for i in range(3):
-        for j in range(3):
-            if ((i < m) or (j < m)):
-                spread[(i) * 3 + j] = (seen.variance[i] if (i == j) else 0.0)
-    for i in range(3):
-        for k in range(m):
-            x[(block + i)] += (to_n[(k) * 3 + i] * seen.innovation[k])
-        for _i in range(n):
-            (p + ((block + i)) * n)[_i] = 0.0
-        for _i in range(n):
-            (p + (block + i))[_i * n] = 0.0
-        for _i in range(3):
-            (half + (i) * 3)[_i] = 0.0
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                half[(i) * 3 + j] += (to_n[(k) * 3 + i] * spread[(k) * 3 + j])
-    for i in range(3):
-        for k in range(3):
-            for j in range(3):
-                p[((block + i)) * n + (block + j)] += (half[(i) * 3 + k] * to_n[(k) * 3 + j])
+    gnss_error_place(&rival, source, values, seen, params)
 
 cdef void measurement__reset_offset(State* state, Observation* seen) noexcept nogil:
     cdef double* p
@@ -890,8 +983,8 @@ cdef void measurement__reset_offset(State* state, Observation* seen) noexcept no
     cdef int64_t k
     cdef double variance
     p = state.covariance
-    offset = 26
-    state.nominal[27] += seen.innovation[0]
+    offset = 29
+    state.nominal[30] += seen.innovation[0]
     for _i in range(n):
         (p + (offset) * n)[_i] = 0.0
     for _i in range(n):
@@ -1201,7 +1294,7 @@ cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b
     auxiliary = state.auxiliary
     smooth = ((1 - portable_exp(((-dt) / 0.08))) if (auxiliary[20] > 0) else 1.0)
     for _i in range(3):
-        (auxiliary + 36)[_i] += (smooth * (force_b[_i] - (auxiliary + 36)[_i]))
+        (auxiliary + 37)[_i] += (smooth * (force_b[_i] - (auxiliary + 37)[_i]))
     share = (1 - portable_exp(((-dt) / 0.5)))
     weight = (auxiliary[20] + (share * (1 - auxiliary[20])))
     auxiliary[20] = weight
@@ -1326,14 +1419,14 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* par
     _t1 = measurement_update_update_projected(state, &seen, params.gates[seen.m], factor, True, 0.0, across, spread)
     ratio = _t1[0]
     fused = _t1[1]
-    if (state.stamps[21] > 0):
+    if (state.stamps[22] > 0):
         motion_constraints__apply_to_rivals(state, which, params, factor, fits)
     rivals_watch_inertial(state, &seen, factor, spread, fits)
-    state.auxiliary[(32 + which)] = ratio
+    state.auxiliary[(33 + which)] = ratio
     if fused:
-        state.stamps[(11 + which)] += 1
+        state.stamps[(12 + which)] += 1
     else:
-        state.stamps[(14 + which)] += 1
+        state.stamps[(15 + which)] += 1
     return fused
 
 cdef void motion_constraints__apply_to_rivals(State* state, int64_t which, Parameters* params, double factor, double fits) noexcept nogil:
@@ -1424,16 +1517,19 @@ cdef bint barometric_height_observe(State* state, double* row, double* parameter
     model_begin(seen, 1)
     for _i in range(3):
         (seen.jacobian + (0) * n)[_i] = (-(to_n + (2) * 3)[_i])
-    seen.jacobian[(0) * n + 26] = 1.0
+    seen.jacobian[(0) * n + 29] = 1.0
     _t1 = wgs84_geodetic(x)
     _ = _t1[0]
     _ = _t1[1]
     height = _t1[2]
-    seen.innovation[0] = ((row[0] - height) - x[27])
+    seen.innovation[0] = ((row[0] - height) - x[30])
     seen.variance[0] = row[1]
     return True
 
 # ---------------- fusiond.filter.observations.gnss_position
+
+cdef double gnss_position_slow_share(double* parameter) noexcept nogil:
+    return ((1 - 0.2) if (parameter[5] > 0) else 0.0)
 
 cdef bint gnss_position_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double* x
@@ -1446,6 +1542,7 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     cdef double _t3[3 * 3]
     cdef int64_t i
     cdef double off_e[3]
+    cdef double slow
     cdef double _t4[3]
     cdef double _t5
     x = state.nominal
@@ -1453,7 +1550,7 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_begin(seen, 3)
     delay = 0.0
     if (parameter[4] != 0.0):
-        delay = x[25]
+        delay = x[28]
         gnss_position__calibrated(state, parameter, to_n, seen, _t1)
         for _i in range(3):
             lever_e[_i] = _t1[_i]
@@ -1468,13 +1565,20 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
     for _i in range(3):
         off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
+    slow = gnss_position_slow_share(parameter)
+    if (slow > 0):
+        for _i in range(3):
+            off_e[_i] -= (x + 19)[_i]
+        for i in range(3):
+            for _i in range(3):
+                (seen.jacobian + (i) * n + 18)[_i] = (to_n + (i) * 3)[_i]
     rotation_times(to_n, off_e, _t4)
     for _i in range(3):
         seen.innovation[_i] = _t4[_i]
-    _t5 = row[3]
+    _t5 = ((1 - slow) * row[3])
     seen.variance[0] = _t5
     seen.variance[1] = _t5
-    seen.variance[2] = row[4]
+    seen.variance[2] = ((1 - slow) * row[4])
     return True
 
 cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n, Observation* seen, double* out) noexcept nogil:
@@ -1493,22 +1597,22 @@ cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n,
     cdef double _t3[3]
     x = state.nominal
     model_mat_eb(state, rotation)
-    delay = x[25]
+    delay = x[28]
     for _i in range(3):
-        arm_b[_i] = (lever_b[_i] + (x + 22)[_i])
+        arm_b[_i] = (lever_b[_i] + (x + 25)[_i])
     model_rate_b(state, _t1)
     rotation_cross(_t1, arm_b, swing_b)
     rotation_matrix_product(to_n, rotation, turned)
     model_skew_rows(turned, arm_b, (-delay), 3, seen.jacobian, 9)
     model_mean_rate_b(state, _t2)
-    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 21)
+    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 24)
     for i in range(3):
         along = 0.0
         for j in range(3):
             seen.jacobian[(i) * n + (3 + j)] = (to_n[(i) * 3 + j] * (-delay))
-            seen.jacobian[(i) * n + (21 + j)] += turned[(i) * 3 + j]
+            seen.jacobian[(i) * n + (24 + j)] += turned[(i) * 3 + j]
             along += ((to_n[(i) * 3 + j] * x[(3 + j)]) + (turned[(i) * 3 + j] * swing_b[j]))
-        seen.jacobian[(i) * n + 24] = (-along)
+        seen.jacobian[(i) * n + 27] = (-along)
     for _i in range(3):
         _t3[_i] = (arm_b[_i] - (swing_b[_i] * delay))
     rotation_times(rotation, _t3, out)
@@ -1542,7 +1646,7 @@ cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Ob
         arm_b[_i] = parameter[_i]
     if (parameter[4] != 0.0):
         for _i in range(3):
-            arm_b[_i] += (x + 22)[_i]
+            arm_b[_i] += (x + 25)[_i]
     model_rate_b(state, _t2)
     rotation_cross(_t2, arm_b, _t1)
     rotation_times(rotation, _t1, swing_e)
@@ -1581,24 +1685,24 @@ cdef void gnss_velocity__gained(State* state, double* to_n, double* turned, Obse
     cdef double along
     cdef int64_t j
     x = state.nominal
-    delay = (x[25] + x[(25 + 1)])
+    delay = (x[28] + x[(28 + 1)])
     model_mat_eb(state, _t1)
     for _i in range(3):
-        _t2[_i] = ((state.auxiliary + 36)[_i] - (x + 13)[_i])
+        _t2[_i] = ((state.auxiliary + 37)[_i] - (x + 13)[_i])
     rotation_times(_t1, _t2, force_e)
     wgs84_gravity_e(x, rest_e)
     rest_e[0] += ((2 * 7.292115e-05) * x[(3 + 1)])
     rest_e[1] -= ((2 * 7.292115e-05) * x[3])
     model_mean_rate_b(state, _t3)
-    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 21)
+    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 24)
     model_skew_rows(to_n, rest_e, (-delay), seen.m, seen.jacobian, 6)
     for i in range(seen.m):
         along = 0.0
         for j in range(3):
             along += (to_n[(i) * 3 + j] * (force_e[j] + rest_e[j]))
             seen.jacobian[(i) * n + (12 + j)] = (turned[(i) * 3 + j] * delay)
-        seen.jacobian[(i) * n + 24] = (-along)
-        seen.jacobian[(i) * n + (24 + 1)] = (-along)
+        seen.jacobian[(i) * n + 27] = (-along)
+        seen.jacobian[(i) * n + (27 + 1)] = (-along)
         seen.jacobian[(i) * n + 3] += (to_n[(i) * 3 + 1] * ((2 * 7.292115e-05) * delay))
         seen.jacobian[(i) * n + (3 + 1)] -= (to_n[(i) * 3 + 0] * ((2 * 7.292115e-05) * delay))
     for _i in range(3):
@@ -1659,7 +1763,7 @@ cdef void model_with_rate_noise(State* state, Observation* seen) noexcept nogil:
     cdef double* by
     for a in range(seen.m):
         by = seen.jacobian + (a) * n + 9
-        seen.variance[a] += (state.auxiliary[35] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
+        seen.variance[a] += (state.auxiliary[36] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
 
 cdef void model_mean_rate_b(State* state, double* out) noexcept nogil:
     cdef int _i
@@ -1938,7 +2042,7 @@ cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, 
     cdef double _t2
     cdef double _t3
     a = state.auxiliary
-    if ((state.bank[(0) * BLOCK + 0] > 0) or (state.nominal[28] > 0.3) or (not (fits > 0))):
+    if ((state.bank[(0) * BLOCK + 0] > 0) or (state.nominal[31] > 0.3) or (not (fits > 0))):
         return
     for i in range(seen.m):
         for j in range(seen.m):
@@ -1946,11 +2050,11 @@ cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, 
             for k in range(3, 15):
                 widened[(i) * 3 + j] += ((seen.jacobian[(i) * n + k] * rivals_lie_variance(k)) * seen.jacobian[(j) * n + k])
     lied = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, widened)
-    _t1 = a[39]
+    _t1 = a[40]
     _t2 = 1e-06
     _t3 = ((_t2 if _t2 > _t1 else _t1) * (lied / fits))
-    a[39] = (1000000000000.0 if 1000000000000.0 < _t3 else _t3)
-    if (a[39] >= 0.01):
+    a[40] = (1000000000000.0 if 1000000000000.0 < _t3 else _t3)
+    if (a[40] >= 0.01):
         rivals__suspect_motion(state, 0.01)
 
 cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
@@ -1959,19 +2063,19 @@ cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
         rival = hypothesis_of(state, 0)
-        rival.nominal[28] = 1.0
+        rival.nominal[31] = 1.0
         for k in range(3, 15):
             rival.covariance[(k) * n + k] += rivals_lie_variance(k)
     if (state.bank[(3) * BLOCK + 0] == 0):
         rivals_open_slot(state, 3, odds)
-    state.auxiliary[39] = 1e-06
+    state.auxiliary[40] = 1e-06
 
 cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nogil:
     cdef State rival
     cdef int _i
     cdef int64_t k
     if (state.bank[(slot) * BLOCK + 0] == 0):
-        state.stamps[21] += 1
+        state.stamps[22] += 1
     state.bank[(slot) * BLOCK + 0] = odds
     rival = hypothesis_of(state, slot)
     for _i in range(NOMINAL_SIZE):
@@ -1983,7 +2087,7 @@ cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nog
 cdef void rivals_close_slot(State* state, int64_t slot) noexcept nogil:
     cdef int _i
     if (state.bank[(slot) * BLOCK + 0] > 0):
-        state.stamps[21] -= 1
+        state.stamps[22] -= 1
     for _i in range(BLOCK):
         (state.bank + (slot) * BLOCK)[_i] = 0.0
 
@@ -1991,7 +2095,7 @@ cdef bint rivals_uses(State* state, int64_t slot, int64_t source, Parameters* pa
     cdef int64_t suspect
     if ((slot == 3) and (params.models[source] == 2)):
         return False
-    suspect = (<int64_t>(state.stamps[22]))
+    suspect = (<int64_t>(state.stamps[23]))
     if ((suspect >= 0) and ((source == suspect) or (source == (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))))):
         if (slot == 1):
             return False
@@ -2012,13 +2116,13 @@ cdef void rivals_suspect_receiver(State* state, int64_t source, double before, P
     odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
     suspect = rivals_position_of(source, params)
     if (state.bank[(1) * BLOCK + 0] > 0):
-        if ((state.stamps[22] == suspect) and (before > 0)):
+        if ((state.stamps[23] == suspect) and (before > 0)):
             _t1 = (state.bank[(1) * BLOCK + 0] * (odds / before))
             state.bank[(1) * BLOCK + 0] = (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
         return
     if ((odds < 0.01) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
         return
-    state.stamps[22] = suspect
+    state.stamps[23] = suspect
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
     rivals__suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) * 0.01))
 
@@ -2045,7 +2149,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[40] + (0.0001 * (0.0 if 0.0 > since else since)))
+    _t1 = (state.auxiliary[41] + (0.0001 * (0.0 if 0.0 > since else since)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
@@ -2071,7 +2175,7 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
         if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 * total)):
             rivals_close_slot(state, slot)
     inertial = hypothesis_of(state, 0)
-    if ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[28] < 0.05)):
+    if ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[31] < 0.05)):
         if (state.bank[(0) * BLOCK + 0] < 1):
             rivals_close_slot(state, 0)
         if (0 < state.bank[(3) * BLOCK + 0] < 1):
@@ -2102,7 +2206,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
     cdef int64_t other
     cdef int64_t source
     rival = hypothesis_of(state, slot)
-    suspect = (<int64_t>(state.stamps[22]))
+    suspect = (<int64_t>(state.stamps[23]))
     for _i in range(NOMINAL_SIZE):
         state.nominal[_i] = rival.nominal[_i]
     for k in range(n):
@@ -2111,7 +2215,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
     for other in range(4):
         rivals_close_slot(state, other)
     if (slot == 0):
-        state.auxiliary[40] = 0.5
+        state.auxiliary[41] = 0.5
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
@@ -2125,7 +2229,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
     else:
         rivals_exclude(state, suspect, 0.0, params)
         state_count_reset(state, 4)
-        state.stamps[19] = suspect
+        state.stamps[20] = suspect
 
 cdef void rivals_exclude(State* state, int64_t suspect, double excluded, Parameters* params) noexcept nogil:
     cdef int64_t companion
@@ -2422,8 +2526,8 @@ cdef bint state_is_finite(State* state) noexcept nogil:
     return isfinite(total)
 
 cdef void state_count_reset(State* state, int64_t reason) noexcept nogil:
-    state.stamps[10] += 1
-    state.stamps[18] = reason
+    state.stamps[11] += 1
+    state.stamps[19] = reason
 
 # ---------------- fusiond.filter.step
 
@@ -2439,9 +2543,9 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
         row.outcome = 3
         return
     row.outcome = 0
-    if (state.stamps[9] == 1):
+    if (state.stamps[10] == 1):
         initial_alignment_gather_motion(state, row, params)
-    elif (state.stamps[9] == 3):
+    elif (state.stamps[10] == 3):
         step__choose(state, row, imu, params)
         step_guard(state)
     else:
@@ -2465,7 +2569,7 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
     cdef int64_t model
     cdef double grown
     stamps = state.stamps
-    phase = (<int64_t>(state.stamps[9]))
+    phase = (<int64_t>(state.stamps[10]))
     t_ns, model = (<int64_t>row.t_ns), (<int64_t>(params.models[(<int64_t>row.source)]))
     if ((phase == 0) or ((t_ns - stamps[0]) > params.restart_gap_ns)):
         return False
@@ -2528,7 +2632,7 @@ cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* par
     cdef State rival
     begin = (<int64_t>(state.stamps[0]))
     step_advance(state, t_ns, imu, params)
-    if (state.stamps[21] > 0):
+    if (state.stamps[22] > 0):
         for slot in range(4):
             if (state.bank[(slot) * BLOCK + 0] > 0):
                 state.stamps[0] = begin
@@ -2562,7 +2666,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     frozen = (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE))
     if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > params.imu_gap_ns) or frozen):
         strapdown_coast(state, dt, &params.noise, motion_constraints_rests(state, params))
-        a[35] = (0.5 * 0.5)
+        a[36] = (0.5 * 0.5)
         return
     sample = imu.values
     span = (<double>((imu.t_ns - held)))
@@ -2580,7 +2684,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
         (a + 6)[_i] = (a[_i] + (end * force_change[_i]))
     for _i in range(3):
         (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
-    a[35] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
+    a[36] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
     strapdown_propagate(state, dt, force_b, rate_b, &params.noise)
 
 cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
@@ -2590,10 +2694,10 @@ cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept 
     cdef State rival
     stamps = state.stamps
     begin = (<int64_t>(stamps[0]))
-    if (stamps[9] != 2):
+    if (stamps[10] != 2):
         return
     step__predict(state, t_ns, params)
-    if (stamps[21] > 0):
+    if (stamps[22] > 0):
         for slot in range(4):
             if (state.bank[(slot) * BLOCK + 0] > 0):
                 stamps[0] = begin
@@ -2664,9 +2768,13 @@ cdef void step__choose(State* state, Row* row, Row* imu, Parameters* params) noe
     factor = measurement_factor_of(own, model, values, parameter, t_ns)
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
+            if (model == 0):
+                hypothesis = hypothesis_of(state, i)
+                gnss_error_carry(&hypothesis, source, values, params)
             heading_bank_fuse_measurement(state, i, model, values, parameter, factor, params)
     own[1] = t_ns
     if (model == 0):
+        gnss_error_note(state, source, params)
         stamps[4] = t_ns
     heading_bank_collapse_if_close(state, params)
 
@@ -2687,7 +2795,7 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     same = source_health_arrive(memory, own, row.values, t_ns)
     source_health_judge_repetition(memory, own, same, t_ns)
     step_hold(state, row.values, t_ns)
-    a[35] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
+    a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
@@ -2709,15 +2817,15 @@ cdef void step_guard(State* state) noexcept nogil:
     cdef int64_t i
     cdef int64_t resets
     cdef int64_t blown
-    if (state.stamps[9] == 3):
+    if (state.stamps[10] == 3):
         for i in range(13):
             if (state.bank[(i) * BLOCK + 0] > 0):
                 return
     elif state_is_finite(state):
         return
-    resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
+    resets, blown = (<int64_t>(state.stamps[11])), (<int64_t>(state.stamps[18]))
     clear_state(state)
-    state.stamps[10], state.stamps[17] = resets, (blown + 1)
+    state.stamps[11], state.stamps[18] = resets, (blown + 1)
     state_count_reset(state, 3)
 
 cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int64_t source, int64_t sequence) noexcept nogil:
@@ -2836,12 +2944,12 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     for _i in range(4):
         (x + 6)[_i] = _t12[_i]
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
-    doubt = x[28]
+    doubt = x[31]
     strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 1.0)), (noise.gyro + (doubt * 0.01)), noise)
     if (doubt > 0):
         for i in range(3):
             state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.01) * dt)
-        x[28] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
+        x[31] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
 
 cdef void strapdown_gravity_gradient(double* position_e, double* out) noexcept nogil:
     cdef double r2

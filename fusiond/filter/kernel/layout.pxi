@@ -1,17 +1,17 @@
 # Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 cdef enum:
-    NOMINAL_SIZE = 29
-    AUXILIARY_SIZE = 41
+    NOMINAL_SIZE = 32
+    AUXILIARY_SIZE = 42
     MEMORY_SIZE = 20
-    STAMPS_SIZE = 23
+    STAMPS_SIZE = 24
     SOURCE_STAMPS_SIZE = 4
     HYPOTHESES = 13
     CALIBRATIONS = 15
-    WIDE_SIZE = 27
-    PHASE = 9
+    WIDE_SIZE = 30
+    PHASE = 10
     CHOOSING = 3
-    ALIVE = 21
+    ALIVE = 22
     T = 0
     VALUES = 8
     PARAMETERS = 16

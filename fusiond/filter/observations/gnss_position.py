@@ -1,4 +1,5 @@
-"""GNSS position: the antenna's place, through the lever arm from the IMU. Groves (2013), equation 14.102."""
+"""GNSS position: the antenna's place, through the lever arm from the IMU, and the error that fixes share for a while. Groves
+(2013), equation 14.102."""
 
 from __future__ import annotations
 
@@ -28,6 +29,8 @@ from fusiond.filter.state import (
     ATTITUDE,
     DELAYS,
     DELAYS_ERROR,
+    GNSS_ERROR,
+    GNSS_ERROR_E,
     GYRO_BIAS,
     POSITION,
     POSITION_E,
@@ -43,6 +46,9 @@ from fusiond.maths.wgs84 import ecef, mat_ne
 PLACE_E = slice(0, 3)  # m, values
 VARIANCE_HORIZONTAL, VARIANCE_VERTICAL = 3, 4  # m^2, values
 
+ERROR_TIME = 5  # s, parameters: over which the slow part of the error stays the same; 0: it is all white
+WHITE_SHARE = 0.2  # of the variance, where a part is slow
+
 HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
 
 
@@ -51,7 +57,14 @@ def parameters(gnss: Gnss) -> Array:
     row[LEVER_ARM_B] = gnss.lever_arm_m
     row[CALIBRATED] = float(calibrated(gnss))
     row[RESETS] = POSITION.start
+    row[ERROR_TIME] = gnss.position_correlation_s
     return row
+
+
+@compiled
+def slow_share(parameter: Vector) -> float:
+    """Share of a fix's variance that is the slow error's (fusiond.filter.gnss_error); the rest is white."""
+    return 1 - WHITE_SHARE if parameter[ERROR_TIME] > 0 else 0.0
 
 
 def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
@@ -69,7 +82,8 @@ def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
 
 @compiled
 def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
-    """Innovation (3,) [m], north-east-down. A delay that is a state takes the antenna back along its velocity."""
+    """Innovation (3,) [m], north-east-down: the fix less the antenna and the slow error. A delay that is a state takes the
+    antenna back along its velocity."""
     x = state.nominal
     to_n = mat_ne(x[POSITION_E])
     begin(seen, 3)
@@ -84,9 +98,14 @@ def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observatio
         seen.jacobian[i, POSITION] = to_n[i]
     skew_rows(to_n, lever_e, -1.0, 3, seen.jacobian, ATTITUDE.start)
     off_e = row[PLACE_E] - x[POSITION_E] - lever_e + x[VELOCITY_E] * delay
+    slow = slow_share(parameter)
+    if slow > 0:
+        off_e -= x[GNSS_ERROR_E]
+        for i in range(3):
+            seen.jacobian[i, GNSS_ERROR] = to_n[i]
     seen.innovation[:] = times(to_n, off_e)
-    seen.variance[0] = seen.variance[1] = row[VARIANCE_HORIZONTAL]
-    seen.variance[2] = row[VARIANCE_VERTICAL]
+    seen.variance[0] = seen.variance[1] = (1 - slow) * row[VARIANCE_HORIZONTAL]
+    seen.variance[2] = (1 - slow) * row[VARIANCE_VERTICAL]
     return True
 
 

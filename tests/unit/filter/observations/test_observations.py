@@ -47,9 +47,10 @@ from tests.helpers.observations import Observed, observed
 from tests.helpers.streams import EARTH_RATE_E, MUNICH, running_state
 
 GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
+WHITE = msgspec.structs.replace(GNSS, position_correlation_s=0.0)
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
-STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1])
 BAROMETER = Barometer(link="l")
 ANTENNAS = DualAntenna(link="l", offset_deg=50.0)
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
@@ -76,6 +77,7 @@ def wheel_case(speed: float, reading: float, **changes: bool) -> Case:
 FIX = GnssPosition(*MUNICH, 1.0, 2.0)
 CASES = {
     "position": Case("gnss_position", gnss_position.values(FIX, GNSS), gnss_position.parameters(GNSS), 10.0),
+    "position, white": Case("gnss_position", gnss_position.values(FIX, WHITE), gnss_position.parameters(WHITE), 10.0),
     "velocity": Case(
         "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0, 1.0), GNSS), gnss_velocity.parameters(GNSS), 10.0
     ),
@@ -182,7 +184,7 @@ def test_position_of_the_antenna() -> None:
     row = np.array([*place, 1.0, 4.0, 0.0, 0.0, 0.0])
     seen = found(gnss_position.observe, state, row, gnss_position.parameters(GNSS))
     np.testing.assert_allclose(seen.innovation, 0.0, atol=3e-9)
-    np.testing.assert_array_equal(seen.variance, [1.0, 1.0, 4.0])
+    np.testing.assert_allclose(seen.variance, np.array([1.0, 1.0, 4.0]) * gnss_position.WHITE_SHARE)
 
 
 def test_velocity_of_the_antenna() -> None:
