@@ -75,6 +75,14 @@ FIX_VARIANCE = _auxiliary.block(2)  # m^2, horizontal, vertical
 CONSTRAINT_RATIO = _auxiliary.block(3)  # last test ratios: non-holonomic, zero velocity, zero rotation
 RATE_VARIANCE = _auxiliary.one()  # (rad/s)^2, white noise of RATE_B, per axis
 SMOOTH_FORCE_B = _auxiliary.block(3)  # m/s^2, mean over the delays of receivers
+CHANGE_FORCE = _auxiliary.one()  # (m/s^2)^2, mean square of the change from one inertial sample to the next
+CHANGE_RATE = _auxiliary.one()  # (rad/s)^2
+SUPPORT = _auxiliary.one()  # s, for how long samples agreed with the held one, less how long they did not
+LAST_SENSED = _auxiliary.block(6)  # m/s^2, rad/s: the last sample in the sensor's own axes, believed or not
+QUANTUM = _auxiliary.block(2)  # m/s^2, rad/s: the least change that was seen
+PEAK = _auxiliary.block(2)  # m/s^2, rad/s: the largest reading
+FROZEN_ODDS = _auxiliary.block(6)  # that an axis is frozen
+SHARE_CHANGED = _auxiliary.block(6)  # share of the samples in which an axis changes while the two others of its kind do
 AUXILIARY_SIZE = _auxiliary.size
 
 # Remembered of each source: columns of FilterState.memory
@@ -91,6 +99,7 @@ LAST_SUM = _memory.one()  # of the last reading's numbers: shows a repeated one
 INTERVAL = _memory.one()  # s, mean spacing of the events
 LAST_INNOVATION = _memory.block(3)  # of the last rejection
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
+FROZEN_PLACE = _memory.one()  # which axis of an inertial sensor is frozen (source_health.INERTIAL_AXES); 0: none
 MEMORY_SIZE = _memory.size
 
 # Stamps and counts: places in FilterState.stamps
