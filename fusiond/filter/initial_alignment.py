@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from fusiond.filter import hot_start
+from fusiond.filter import hot_start, inertial_sample
 from fusiond.filter.motion_constraints import MEAN_FILLED, MEAN_TIME, ZERO_VELOCITY, watch
 from fusiond.filter.observations import (
     GNSS_POSITION,
@@ -26,7 +26,7 @@ from fusiond.filter.observations import (
 )
 from fusiond.filter.observations.model import LEVER_ARM_B
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.rows import Row
+from fusiond.filter.rows import Outcome, Row
 from fusiond.filter.source_health import arrive
 from fusiond.filter.state import (
     ACCEL_BIAS_B,
@@ -138,7 +138,11 @@ def gather_motion(state: FilterState, row: Row, params: Parameters) -> None:
         state.memory[source, LAST_SPEED] = values[wheel_speed.SPEED]
     if params.models[source] != IMU:
         return
+    believed = inertial_sample.judge(state, row, params)
     arrive(state.memory[source], state.source_stamps[source], values, t_ns)
+    if not believed:
+        row["outcome"] = Outcome.REJECTED
+        return
     if stamps[T_IMU] != NEVER:
         watch(state, values[0:3], values[3:6], (t_ns - stamps[T_IMU]) * 1e-9, params)
     stamps[T_IMU] = t_ns

@@ -26,10 +26,12 @@ from fusiond.filter.state import (
 from fusiond.filter.stored_state import StoredState
 from fusiond.filter.strapdown import ProcessNoise
 from fusiond.maths.portable import square
+from fusiond.maths.rotation import matrix_from_euler
 from fusiond.maths.statistics import chi_square
 from fusiond.maths.typed import Array
 from fusiond.units import nanoseconds
 
+SENSOR_AXES = slice(0, 9)  # parameters of the inertial sensor: rotation (3, 3) from its axes to the body's, row by row
 CREEPING_TIME = 1.0  # s, over which a vehicle that creeps unseen keeps its speed
 
 
@@ -130,7 +132,9 @@ def _parameters(source: str, sources: tuple[str, ...], config: Config, streams: 
     table, name, section, stream, _ = streams[source]
     model = model_of(stream)
     if model == IMU:
-        return empty_row()
+        row = empty_row()
+        row[SENSOR_AXES] = matrix_from_euler(*(math.radians(angle) for angle in section.rotation_deg)).ravel()
+        return row
     row = MODELS[model].parameters(section)
     row[CORRELATION] = stream.correlation_s
     row[NOISE_MIN], row[NOISE_MAX] = square(stream.noise_min), square(stream.noise_max)

@@ -287,7 +287,8 @@ def _lead(state: FilterState, slot: int, params: Parameters) -> None:
         count_reset(state, ResetReason.INERTIAL_LIED)
         for source in range(state.sources):
             state.memory[source, EXCLUDED] = 0.0
-            begin(state.memory[source])
+            if source != params.imu_source:
+                begin(state.memory[source])
     elif slot == WHEELS:
         for source in range(state.sources):
             if params.models[source] == WHEEL_SPEED:

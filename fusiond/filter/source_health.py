@@ -23,6 +23,7 @@ from fusiond.filter.state import (
     BIASED,
     EXCLUDED,
     FROZEN,
+    FROZEN_PLACE,
     INTERVAL,
     LAST_SUM,
     MEAN_NIS,
@@ -72,6 +73,7 @@ class Belief(NamedTuple):
     reason: str
 
 
+INERTIAL_AXES = ("accelerometer x", "accelerometer y", "accelerometer z", "gyro x", "gyro y", "gyro z")  # by FROZEN_PLACE
 STATUSES = ("nominal", "noisy", "biased", "frozen", "absent")
 
 
@@ -90,6 +92,18 @@ def judge_repetition(memory: Vector, stamps: Stamps, same: bool, t_ns: int) -> N
     if is_due(stamps, t_ns, 0.0):
         nothing = np.zeros(3)
         judge(memory, stamps, nothing, 0, same, t_ns)
+
+
+@compiled
+def blame_frozen(memory: Vector, probability: float) -> None:
+    """Take a source as frozen with at least this probability, because a part of it is."""
+    if memory[NOMINAL] + memory[NOISY] + memory[BIASED] + memory[FROZEN] == 0:
+        begin(memory)
+    if memory[FROZEN] < probability:
+        rest = (1 - probability) / (1 - memory[FROZEN])
+        for i in range(4):
+            memory[NOMINAL + i] *= rest
+        memory[FROZEN] = probability
 
 
 @compiled
@@ -311,6 +325,10 @@ def _reason(memory: Array, status: str, age: float) -> str:
         case "biased":
             off = max(memory[BIAS].tolist(), key=abs)
             return f"constant error of {abs(off):.0f} sigma; not fused"
+        case "frozen" if memory[FROZEN_PLACE]:
+            number = int(memory[FROZEN_PLACE]) - 1
+            what = "sits at its largest reading: saturated" if number >= len(INERTIAL_AXES) else "repeats one reading"
+            return f"{INERTIAL_AXES[number % len(INERTIAL_AXES)]} {what} while the other axes move; not fused"
         case "frozen":
             return "it repeats one reading while the vehicle moves; not fused"
         case "absent":

@@ -80,6 +80,14 @@ RATE_VARIANCE = _auxiliary.one()  # (rad/s)^2, white noise of RATE_B, per axis
 SMOOTH_FORCE_B = _auxiliary.block(3)  # m/s^2, mean over the delays of receivers
 INERTIAL_ODDS = _auxiliary.one()  # that the inertial sensor lied a moment ago
 STATE_DOUBT = _auxiliary.one()  # probability that the position is wrong, since the inertial sensor lied
+CHANGE_FORCE = _auxiliary.one()  # (m/s^2)^2, mean square of the change from one inertial sample to the next
+CHANGE_RATE = _auxiliary.one()  # (rad/s)^2
+SUPPORT = _auxiliary.one()  # s, for how long samples agreed with the held one, less how long they did not
+LAST_SENSED = _auxiliary.block(6)  # m/s^2, rad/s: the last sample in the sensor's own axes, believed or not
+QUANTUM = _auxiliary.block(2)  # m/s^2, rad/s: the least change that was seen
+PEAK = _auxiliary.block(2)  # m/s^2, rad/s: the largest reading
+FROZEN_ODDS = _auxiliary.block(6)  # that an axis is frozen
+SHARE_CHANGED = _auxiliary.block(6)  # share of the samples in which an axis changes while the two others of its kind do
 AUXILIARY_SIZE = _auxiliary.size
 
 # Remembered of each source: columns of FilterState.memory
@@ -97,6 +105,7 @@ INTERVAL = _memory.one()  # s, mean spacing of the events
 BEFORE = _memory.block(4)  # the probabilities before the look that the newest readings share
 EXCLUDED = _memory.one()  # 1: a receiver that was found to lie
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
+FROZEN_PLACE = _memory.one()  # which axis of an inertial sensor is frozen (source_health.INERTIAL_AXES); 0: none
 MEMORY_SIZE = _memory.size
 
 # Stamps and counts: places in FilterState.stamps

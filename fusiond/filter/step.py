@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 
-from fusiond.filter import gnss_error, heading_bank, initial_alignment, source_health
+from fusiond.filter import gnss_error, heading_bank, inertial_sample, initial_alignment, source_health
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
@@ -49,12 +49,11 @@ from fusiond.filter.state import (
     count_reset,
     is_finite,
 )
-from fusiond.filter.strapdown import COAST_RATE, COAST_TURN, coast, propagate
+from fusiond.filter.strapdown import COAST_RATE, COAST_TURN, add_white_noise, coast, propagate
 from fusiond.maths.portable import square
 from fusiond.maths.typed import Stamps, Vector, compiled
 
 LOST_HEADING = math.radians(12.0)  # sigma, after coasting: the filter may not recover from such errors: it aligns again
-MIN_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 
 
 @compiled
@@ -96,7 +95,7 @@ def can_step(state: FilterState, row: Row, params: Parameters) -> bool:
         return False
     if phase == ALIGNING:
         return model not in (GNSS_POSITION, GNSS_VELOCITY)
-    if phase == RUNNING and model == IMU and coasts(state, t_ns, params):
+    if phase == RUNNING and model == IMU and coasts(state, t_ns, params) and source_health.is_trusted(state.memory[params.imu_source]):
         grown = square(COAST_TURN) * ((t_ns - stamps[T]) * 1e-9)
         return not yaw_variance(state) + grown > square(LOST_HEADING) / 2
     return True
@@ -210,16 +209,23 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) 
         coast(state, dt, params.noise, rests(state, params))
         a[RATE_VARIANCE] = COAST_RATE * COAST_RATE
         return
-    sample = imu["values"]
-    span = float(imu["t_ns"] - held)
-    middle = float((begin - held) + (t_ns - held)) / 2 / span
-    end = float(t_ns - held) / span
+    sample, until = imu["values"], int(imu["t_ns"])
+    believed = inertial_sample.is_believed(state, sample, until, params)
+    accel, gyro = inertial_sample.doubt(state, sample, t_ns, until, believed, params)
+    span = float(until - held)
+    middle = end = 0.0  # the held sample alone
+    if believed:
+        middle = float((begin - held) + (t_ns - held)) / 2 / span
+        end = float(t_ns - held) / span
     force_change, rate_change = sample[0:3] - a[HELD_FORCE_B], sample[3:6] - a[HELD_RATE_B]
     force_b, rate_b = a[HELD_FORCE_B] + middle * force_change, a[HELD_RATE_B] + middle * rate_change
     a[FORCE_B] = a[HELD_FORCE_B] + end * force_change
     a[RATE_B] = a[HELD_RATE_B] + end * rate_change
     a[RATE_VARIANCE] = params.noise.gyro / (span * 1e-9) * ((1 - end) * (1 - end) + end * end)
     propagate(state, dt, force_b, rate_b, params.noise)
+    if accel > 0:
+        add_white_noise(state.covariance, dt, accel, gyro)
+        a[RATE_VARIANCE] += gyro / (span * 1e-9)
 
 
 @compiled
@@ -293,14 +299,18 @@ def _choose(state: FilterState, row: Row, imu: Row | None, params: Parameters) -
 
 @compiled
 def keep_sample(state: FilterState, row: Row, params: Parameters) -> None:
-    """Make an IMU sample the held one; let it show standstill."""
+    """Judge an IMU sample; if it is believed, make it the held one, and let it show standstill."""
     stamps, a, t_ns = state.stamps, state.auxiliary, int(row["t_ns"])
     dt = (t_ns - stamps[T_IMU]) * 1e-9 if stamps[T_IMU] != NEVER else 0.0
     memory, own = state.memory[params.imu_source], state.source_stamps[params.imu_source]
-    same = source_health.arrive(memory, own, row["values"], t_ns)
-    source_health.judge_repetition(memory, own, same, t_ns)
+    trusted, believed = source_health.is_trusted(memory), inertial_sample.judge(state, row, params)
+    source_health.arrive(memory, own, row["values"], t_ns)
+    inertial_sample.judge_sensor(state, row["values"], t_ns, params)
+    if not (believed and trusted and source_health.is_trusted(memory)):
+        row["outcome"] = Outcome.REJECTED
+        return
     hold(state, row["values"], t_ns)
-    a[RATE_VARIANCE] = params.noise.gyro / max(dt, MIN_SPAN) if dt > 0 else 0.0
+    a[RATE_VARIANCE] = params.noise.gyro / max(dt, inertial_sample.MIN_SPAN) if dt > 0 else 0.0
     watch(state, a[HELD_FORCE_B], a[HELD_RATE_B], dt, params)
 
 

@@ -170,17 +170,24 @@ def _grow(p: Covariance, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient:
 @compiled
 def _add_noise(p: Covariance, dt: float, accel: float, gyro: float, noise: ProcessNoise) -> None:
     """P += Q, with isotropic white noise on acceleration and rate, and random walks of the rest."""
+    add_white_noise(p, dt, accel, gyro)
+    for i in range(3):
+        p[ACCEL_BIAS.start + i, ACCEL_BIAS.start + i] += noise.accel_bias * dt
+        p[GYRO_BIAS.start + i, GYRO_BIAS.start + i] += noise.gyro_bias * dt
+    for i in range(CALIBRATIONS, len(p)):
+        p[i, i] += noise.calibrations[i - CALIBRATIONS] * dt
+
+
+@compiled
+def add_white_noise(p: Covariance, dt: float, accel: float, gyro: float) -> None:
+    """What isotropic white noise on acceleration [(m/s^2)^2/Hz] and rate [(rad/s)^2/Hz] adds to P over `dt` [s]."""
     cubic, quadratic = accel * dt * dt / 3 * dt, accel * dt * dt / 2
     for i in range(3):
         p[POSITION.start + i, POSITION.start + i] += cubic
         p[VELOCITY.start + i, VELOCITY.start + i] += accel * dt
         p[ATTITUDE.start + i, ATTITUDE.start + i] += gyro * dt
-        p[ACCEL_BIAS.start + i, ACCEL_BIAS.start + i] += noise.accel_bias * dt
-        p[GYRO_BIAS.start + i, GYRO_BIAS.start + i] += noise.gyro_bias * dt
         p[POSITION.start + i, VELOCITY.start + i] += quadratic
         p[VELOCITY.start + i, POSITION.start + i] += quadratic
-    for i in range(CALIBRATIONS, len(p)):
-        p[i, i] += noise.calibrations[i - CALIBRATIONS] * dt
 
 
 @compiled

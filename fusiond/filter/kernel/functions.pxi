@@ -705,6 +705,238 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
 
+# ---------------- fusiond.filter.inertial_sample
+
+cdef (double, double, double, double) inertial_sample_compare(State* state, double* values, double elapsed, Parameters* params) noexcept nogil:
+    cdef double* a
+    cdef double _t1
+    cdef double force
+    cdef double rate
+    cdef int64_t i
+    cdef double white
+    cdef double _t2
+    cdef double _t3
+    cdef double _t4
+    cdef double _t5
+    a = state.auxiliary
+    _t1 = 0.0
+    force = _t1
+    rate = _t1
+    for i in range(3):
+        force += portable_square((values[i] - a[(0 + i)]))
+        rate += portable_square((values[(3 + i)] - a[(3 + i)]))
+    white = (6.0 / (0.0001 if 0.0001 > elapsed else elapsed))
+    _t2 = a[42]
+    _t3 = (white * params.noise.accel)
+    _t4 = a[43]
+    _t5 = (white * params.noise.gyro)
+    return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
+
+cdef double inertial_sample_ratio_of(double change, double own, double blow) noexcept nogil:
+    return (change / ((36.0 * own) + portable_square(blow)))
+
+cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
+    cdef int64_t held
+    cdef double elapsed
+    cdef (double, double, double, double) _t1
+    cdef double force
+    cdef double rate
+    cdef double own_force
+    cdef double own_rate
+    held = state.stamps[1]
+    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns) or (not (state.auxiliary[44] > inertial_sample__since_last(state, t_ns, params)))):
+        return True
+    elapsed = ((t_ns - held) * 1e-09)
+    _t1 = inertial_sample_compare(state, values, elapsed, params)
+    force = _t1[0]
+    rate = _t1[1]
+    own_force = _t1[2]
+    own_rate = _t1[3]
+    if (inertial_sample_ratio_of(force, own_force, (40.0 + (400.0 * elapsed))) > 1):
+        return False
+    return (not (inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed))) > 1))
+
+cdef double inertial_sample__since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
+    return ((t_ns - state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0]) * 1e-09)
+
+cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noexcept nogil:
+    cdef double* a
+    cdef double* values
+    cdef int64_t t_ns
+    cdef int64_t held
+    cdef double elapsed
+    cdef double since
+    cdef (double, double, double, double) _t1
+    cdef double force
+    cdef double rate
+    cdef double own_force
+    cdef double own_rate
+    cdef double by_force
+    cdef double by_rate
+    cdef double share
+    cdef double _t2
+    cdef double _t3
+    cdef double _t4
+    cdef int64_t i
+    cdef bint believed
+    a = state.auxiliary
+    values = row.values
+    t_ns = (<int64_t>row.t_ns)
+    held = state.stamps[1]
+    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns)):
+        a[44] = 0.0
+        return True
+    elapsed, since = ((t_ns - held) * 1e-09), inertial_sample__since_last(state, t_ns, params)
+    _t1 = inertial_sample_compare(state, values, elapsed, params)
+    force = _t1[0]
+    rate = _t1[1]
+    own_force = _t1[2]
+    own_rate = _t1[3]
+    by_force = inertial_sample_ratio_of(force, own_force, (40.0 + (400.0 * elapsed)))
+    by_rate = inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed)))
+    share = (since / (1.0 + since))
+    _t2 = (16.0 * own_force)
+    a[42] += (share * ((_t2 if _t2 < force else force) - a[42]))
+    _t3 = (16.0 * own_rate)
+    a[43] += (share * ((_t3 if _t3 < rate else rate) - a[43]))
+    if (not ((by_force > 1) or (by_rate > 1))):
+        _t4 = (a[44] + since)
+        a[44] = (0.15 if 0.15 < _t4 else _t4)
+        return True
+    row.ratio = (by_rate if by_rate > by_force else by_force)
+    for i in range(3):
+        if (by_force > by_rate):
+            row.innovation[i] = (values[i] - a[(0 + i)])
+            row.variance[i] = (own_force / 3)
+        else:
+            row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
+            row.variance[i] = (own_rate / 3)
+    believed = (not (a[44] > since))
+    a[44] = (0.0 if believed else (a[44] - since))
+    return believed
+
+cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
+    cdef int64_t held
+    cdef double elapsed
+    cdef (double, double, double, double) _t1
+    cdef double force
+    cdef double rate
+    cdef double own_force
+    cdef double own_rate
+    cdef bint whole
+    cdef double _t2
+    cdef double _t3
+    cdef double steps
+    held = state.stamps[1]
+    elapsed = ((until_ns - held) * 1e-09)
+    _t1 = inertial_sample_compare(state, values, elapsed, params)
+    force = _t1[0]
+    rate = _t1[1]
+    own_force = _t1[2]
+    own_rate = _t1[3]
+    whole = (believed and (not (state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0] > held)))
+    if (whole and (not ((force > (36.0 * own_force)) or (rate > (36.0 * own_rate))))):
+        return (0.0, 0.0)
+    if (not believed):
+        elapsed, force, rate = ((t_ns - held) * 1e-09), 0.0, 0.0
+    _t2 = state.memory[(params.imu_source) * MEMORY_SIZE + 13]
+    _t3 = (elapsed / (0.0001 if 0.0001 > _t2 else _t2))
+    steps = (1.0 if 1.0 > _t3 else _t3)
+    return ((((own_force * steps) + (0.08333333333333333 * force)) * elapsed), (((own_rate * steps) + (0.08333333333333333 * rate)) * elapsed))
+
+cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
+    cdef double* memory
+    cdef bint same
+    cdef double odds
+    cdef int64_t i
+    cdef double _t1
+    memory = state.memory + (params.imu_source) * MEMORY_SIZE
+    same = inertial_sample_judge_axes(state, values, params)
+    source_health_judge_repetition(memory, state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE, same, t_ns)
+    if (memory[20] > 0):
+        odds = 0.0
+        for i in range(6):
+            _t1 = state.auxiliary[(55 + i)]
+            odds = (_t1 if _t1 > odds else odds)
+        source_health_blame_frozen(memory, (odds / (1 + odds)))
+
+cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* params) noexcept nogil:
+    cdef double* a
+    cdef double* turn
+    cdef double* memory
+    cdef bint same
+    cdef double worst
+    cdef double place
+    cdef double moved[3]
+    cdef int64_t kind
+    cdef int64_t first
+    cdef int64_t i
+    cdef double sensed
+    cdef int64_t j
+    cdef double _t1
+    cdef double _t2
+    cdef double least
+    cdef int64_t lively
+    cdef int64_t k
+    cdef bint changed
+    cdef double _t3
+    cdef double _t4
+    cdef double odds
+    cdef double _t5
+    cdef double _t6
+    cdef double _t7
+    cdef double _t8
+    cdef double chance
+    cdef double _t9
+    cdef bint saturated
+    a = state.auxiliary
+    turn = params.model_parameters + (params.imu_source) * PARAMETERS
+    memory = state.memory + (params.imu_source) * MEMORY_SIZE
+    same, worst, place = True, 1.0, 0.0
+    for kind in range(2):
+        first = (3 * kind)
+        for i in range(3):
+            sensed = 0.0
+            for j in range(3):
+                sensed += (turn[((0 + (3 * j)) + i)] * values[(first + j)])
+            moved[i] = fabs((sensed - a[((45 + first) + i)]))
+            a[((45 + first) + i)] = sensed
+            _t1 = a[(53 + kind)]
+            _t2 = fabs(sensed)
+            a[(53 + kind)] = (_t2 if _t2 > _t1 else _t1)
+            if (moved[i] > 1e-09):
+                same = False
+                if ((a[(51 + kind)] == 0) or (moved[i] < a[(51 + kind)])):
+                    a[(51 + kind)] = moved[i]
+        least, lively = (4.0 * a[(51 + kind)]), 0
+        for i in range(3):
+            lively += (1 if (moved[i] > least) else 0)
+        for i in range(3):
+            k = (first + i)
+            changed = (moved[i] > 1e-09)
+            _t3 = a[(55 + k)]
+            _t4 = 1e-06
+            odds = (_t4 if _t4 > _t3 else _t3)
+            if changed:
+                _t5 = (odds * 0.001)
+                _t6 = 1e-06
+                odds = (_t6 if _t6 > _t5 else _t5)
+            if ((lively - (1 if (moved[i] > least) else 0)) == 2):
+                if (not changed):
+                    _t7 = (1 - a[(61 + k)])
+                    _t8 = (0.3333333333333333 if 0.3333333333333333 > _t7 else _t7)
+                    chance = (0.95 if 0.95 < _t8 else _t8)
+                    _t9 = (odds / chance)
+                    odds = (1000.0 if 1000.0 < _t9 else _t9)
+                a[(61 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(61 + k)]))
+            a[(55 + k)] = odds
+            if (odds > worst):
+                worst = odds
+                saturated = (fabs(a[(45 + k)]) >= a[(53 + kind)])
+                place = ((1.0 + k) + (6 if saturated else 0))
+    memory[20] = place
+    return same
+
 # ---------------- fusiond.filter.initial_alignment
 
 cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* params) noexcept nogil:
@@ -713,6 +945,7 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
     cdef double* values
     cdef int64_t t_ns
     cdef int64_t source
+    cdef bint believed
     cdef int64_t i
     cdef double _t1
     cdef double _t2
@@ -727,7 +960,11 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
         state.memory[(source) * MEMORY_SIZE + 0] = values[0]
     if (params.models[source] != -1):
         return
+    believed = inertial_sample_judge(state, row, params)
     source_health_arrive(state.memory + (source) * MEMORY_SIZE, state.source_stamps + (source) * SOURCE_STAMPS_SIZE, values, t_ns)
+    if (not believed):
+        row.outcome = 1
+        return
     if (stamps[1] != (<int64_t>-4611686018427387904)):
         motion_constraints_watch(state, values, values + 3, ((t_ns - stamps[1]) * 1e-09), params)
     stamps[1] = t_ns
@@ -2219,7 +2456,8 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
-            source_health_begin(state.memory + (source) * MEMORY_SIZE)
+            if (source != params.imu_source):
+                source_health_begin(state.memory + (source) * MEMORY_SIZE)
     elif (slot == 3):
         for source in range(state.sources):
             if (params.models[source] == 2):
@@ -2303,6 +2541,17 @@ cdef void source_health_judge_repetition(double* memory, int64_t* stamps, bint s
     if source_health_is_due(stamps, t_ns, 0.0):
         memset(nothing, 0, 3 * sizeof(double))
         source_health_judge(memory, stamps, nothing, 0, same, t_ns)
+
+cdef void source_health_blame_frozen(double* memory, double probability) noexcept nogil:
+    cdef double rest
+    cdef int64_t i
+    if ((((memory[4] + memory[5]) + memory[6]) + memory[7]) == 0):
+        source_health_begin(memory)
+    if (memory[7] < probability):
+        rest = ((1 - probability) / (1 - memory[7]))
+        for i in range(4):
+            memory[(4 + i)] *= rest
+        memory[7] = probability
 
 cdef bint source_health_is_due(int64_t* stamps, int64_t t_ns, double correlation) noexcept nogil:
     cdef int64_t pause
@@ -2575,7 +2824,7 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
         return False
     if (phase == 1):
         return (model != 0 and model != 1)
-    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params)):
+    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params) and source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         grown = (portable_square(0.3) * ((t_ns - stamps[0]) * 1e-09))
         return (not ((step_yaw_variance(state) + grown) > (portable_square(0.20943951023931956) / 2)))
     return True
@@ -2648,7 +2897,13 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     cdef double dt
     cdef bint frozen
     cdef double* sample
+    cdef int64_t until
+    cdef bint believed
+    cdef (double, double) _t1
+    cdef double accel
+    cdef double gyro
     cdef double span
+    cdef double _t2
     cdef double middle
     cdef double end
     cdef double force_change[3]
@@ -2669,9 +2924,18 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
         a[36] = (0.5 * 0.5)
         return
     sample = imu.values
-    span = (<double>((imu.t_ns - held)))
-    middle = (((<double>(((begin - held) + (t_ns - held)))) / 2) / span)
-    end = ((<double>((t_ns - held))) / span)
+    until = (<int64_t>imu.t_ns)
+    believed = inertial_sample_is_believed(state, sample, until, params)
+    _t1 = inertial_sample_doubt(state, sample, t_ns, until, believed, params)
+    accel = _t1[0]
+    gyro = _t1[1]
+    span = (<double>((until - held)))
+    _t2 = 0.0
+    middle = _t2
+    end = _t2
+    if believed:
+        middle = (((<double>(((begin - held) + (t_ns - held)))) / 2) / span)
+        end = ((<double>((t_ns - held))) / span)
     for _i in range(3):
         force_change[_i] = (sample[_i] - a[_i])
     for _i in range(3):
@@ -2686,6 +2950,9 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
         (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
     a[36] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
     strapdown_propagate(state, dt, force_b, rate_b, &params.noise)
+    if (accel > 0):
+        strapdown_add_white_noise(state.covariance, dt, accel, gyro)
+        a[36] += (gyro / (span * 1e-09))
 
 cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef int64_t* stamps
@@ -2785,15 +3052,20 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     cdef double dt
     cdef double* memory
     cdef int64_t* own
-    cdef bint same
+    cdef bint trusted
+    cdef bint believed
     stamps = state.stamps
     a = state.auxiliary
     t_ns = (<int64_t>row.t_ns)
     dt = (((t_ns - stamps[1]) * 1e-09) if (stamps[1] != (<int64_t>-4611686018427387904)) else 0.0)
     memory = state.memory + (params.imu_source) * MEMORY_SIZE
     own = state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE
-    same = source_health_arrive(memory, own, row.values, t_ns)
-    source_health_judge_repetition(memory, own, same, t_ns)
+    trusted, believed = source_health_is_trusted(memory), inertial_sample_judge(state, row, params)
+    source_health_arrive(memory, own, row.values, t_ns)
+    inertial_sample_judge_sensor(state, row.values, t_ns, params)
+    if (not (believed and trusted and source_health_is_trusted(memory))):
+        row.outcome = 1
+        return
     step_hold(state, row.values, t_ns)
     a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
@@ -3146,6 +3418,15 @@ cdef void strapdown__grow(double* p, double dt, double* force_e, double* mat_eb,
             (p + i + (9) * n)[_i * n] = (rows + (i) * n + 9)[_i]
 
 cdef void strapdown__add_noise(double* p, double dt, double accel, double gyro, Noise* noise) noexcept nogil:
+    cdef int64_t i
+    strapdown_add_white_noise(p, dt, accel, gyro)
+    for i in range(3):
+        p[((12 + i)) * n + (12 + i)] += (noise.accel_bias * dt)
+        p[((9 + i)) * n + (9 + i)] += (noise.gyro_bias * dt)
+    for i in range(15, n):
+        p[(i) * n + i] += (noise.calibrations[(i - 15)] * dt)
+
+cdef void strapdown_add_white_noise(double* p, double dt, double accel, double gyro) noexcept nogil:
     cdef double cubic
     cdef double quadratic
     cdef int64_t i
@@ -3154,12 +3435,8 @@ cdef void strapdown__add_noise(double* p, double dt, double accel, double gyro, 
         p[((0 + i)) * n + (0 + i)] += cubic
         p[((3 + i)) * n + (3 + i)] += (accel * dt)
         p[((6 + i)) * n + (6 + i)] += (gyro * dt)
-        p[((12 + i)) * n + (12 + i)] += (noise.accel_bias * dt)
-        p[((9 + i)) * n + (9 + i)] += (noise.gyro_bias * dt)
         p[((0 + i)) * n + (3 + i)] += quadratic
         p[((3 + i)) * n + (0 + i)] += quadratic
-    for i in range(15, n):
-        p[(i) * n + i] += (noise.calibrations[(i - 15)] * dt)
 
 cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noexcept nogil:
     cdef double* x
