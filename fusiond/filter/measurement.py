@@ -26,6 +26,7 @@ from fusiond.filter.state import (
     ALIVE,
     BIASED,
     EXCLUDED,
+    INERTIAL_DOUBT,
     HEIGHT_OFFSET,
     HEIGHT_OFFSET_ERROR,
     LAST_RATIO,
@@ -42,7 +43,7 @@ from fusiond.filter.state import (
     T_REJECTED,
     FilterState,
 )
-from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
+from fusiond.maths.typed import ErrorRows3, Matrix3, Stamps, Vector, Vector3, compiled
 from fusiond.maths.wgs84 import mat_ne
 
 OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
@@ -145,11 +146,14 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     fits = rivals.likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0
     ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
     row["ratio"] = memory[LAST_RATIO] = ratio
+    best = 0.0
+    if state.stamps[ALIVE] > 0 and heard and fits > 0:
+        best = rivals.SHARE_OF_LIAR * rivals.unread(seen.variance, weight, m, spread) / fits
     if state.stamps[ALIVE] > 0 and heard:
         main = fits if trusted else rivals.unread(seen.variance, weight, m, spread)
-        _fuse_rivals(state, source, values, factor * noisy, weight, main, params)
+        best = max(best, _fuse_rivals(state, source, values, factor * noisy, weight, main, params))
     if by_rivals and not doubtful:
-        rivals.suspect_receiver(state, source, before, params)
+        rivals.suspect_receiver(state, source, before, best, params)
         if model == GNSS_POSITION and not fused:
             _suspect_state(state, source, values, seen, params)
     if trusted and heard:
@@ -205,8 +209,10 @@ def _judge(
 @compiled
 def _fuse_rivals(
     state: FilterState, source: int, values: Vector, factor: float, weight: float, main: float, params: Parameters
-) -> None:
-    """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them."""
+) -> float:
+    """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them. Returns the best
+    likelihood of those that use it, over that of the main state."""
+    best = 0.0
     model, parameter = params.models[source], params.model_parameters[source]
     seen = Observation(state.size)
     across, spread = np.empty((3, state.size)), np.empty((3, 3))
@@ -223,9 +229,37 @@ def _fuse_rivals(
                 if slot == rivals.WHEELS:
                     rivals.weigh(state, slot, rivals.unread(seen.variance, weight, seen.m, spread), main)
                 continue
-            own = rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
+            prior = 1.0
+            if slot == rivals.INERTIAL:
+                prior = _widen(rival, seen, params.gates[seen.m], across, spread)
+            own = prior * rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             rivals.weigh(state, slot, own, main)
+            if main > 0:
+                best = max(best, own / main)
             update_projected(rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread)
+    return best
+
+
+@compiled
+def _widen(rival: FilterState, seen: Observation, gate: float, across: ErrorRows3, spread: Matrix3) -> float:
+    """Widen the rival in which the inertial sensor lied until it explains a reading, while that is fresh. Returns how much
+    less likely the larger lies are, all together."""
+    prior, scale, whitened = 1.0, 1.0, np.empty(3)
+    if not rival.nominal[INERTIAL_DOUBT] > rivals.FRESH:
+        return prior
+    for _step in range(rivals.WIDENINGS):
+        if not whiten(spread, seen.innovation, seen.variance, seen.m, whitened):
+            return prior
+        distance = 0.0
+        for a in range(seen.m):
+            distance += whitened[a] * whitened[a]
+        if distance <= gate:
+            return prior
+        rivals.widen(rival, scale)
+        project(rival, seen, across, spread)
+        prior *= rivals.LARGER
+        scale *= 4
+    return prior
 
 
 @compiled

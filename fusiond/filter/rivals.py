@@ -29,6 +29,7 @@ from fusiond.filter.state import (
     GYRO_BIAS,
     INERTIAL_DOUBT,
     INERTIAL_ODDS,
+    MAIN_WEIGHT,
     POSITION,
     POSITION_E,
     RESET_SOURCE,
@@ -51,13 +52,19 @@ INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while t
 LEAST_ODDS = 1e-6  # of the inertial sensor having lied, while nothing speaks for it
 BEGIN = 0.01  # odds with which a rival begins
 END = 1e-7  # and below which it is given up
-MAX_ODDS = 1e12
+LEAD = 100.0  # odds against all others with which a rival leads, where no loss says otherwise
+SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
+MAX_ODDS = 1e12  # that one reading gives
+MIN_WEIGHT = 1e-100
 HONEST_AGAIN = 0.02  # odds that a receiver that lied is right again
 MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
-LIE_TURN = 0.1  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
-LIE_RATE = 0.1  # rad/s, by which its gyro bias may be another now
-LIE_SPEED = 1.0  # m/s, by which the velocity may be off
-LIE_FORCE = 1.0  # m/s^2, by which its accelerometer bias may be another now
+LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
+LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
+LIE_SPEED = 0.3  # m/s, by which the velocity may be off
+LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
+FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
+WIDENINGS = 5  # by a factor of 4 in variance each
+LARGER = 0.3  # chance that a lie is as much larger
 WRONG_RATE = 1e-4  # 1/s: how often dead reckoning goes wrong unnoticed
 MAX_WRONG = 0.9
 WRONG_AFTER_LIE = 0.5  # probability that the position is wrong after the inertial sensor lied
@@ -146,11 +153,20 @@ def _suspect_motion(state: FilterState, odds: float) -> None:
 
 
 @compiled
+def widen(state: FilterState, scale: float) -> None:
+    """Take the lie of the inertial sensor as larger: a state that does not explain a reading yet may after all."""
+    for k in range(VELOCITY.start, ACCEL_BIAS.stop):
+        state.covariance[k, k] += scale * lie_variance(k)
+
+
+@compiled
 def open_slot(state: FilterState, slot: int, odds: float) -> None:
-    """Begin a rival as a copy of the main state."""
+    """Begin a rival as a copy of the main state, with odds against that."""
+    if state.stamps[ALIVE] == 0:
+        state.auxiliary[MAIN_WEIGHT] = 1.0
     if state.bank[slot, 0] == 0:
         state.stamps[ALIVE] += 1
-    state.bank[slot, 0] = odds
+    state.bank[slot, 0] = max(odds * state.auxiliary[MAIN_WEIGHT], MIN_WEIGHT)
     rival = state.hypothesis(slot)
     rival.nominal[:] = state.nominal
     for k in range(state.size):
@@ -183,24 +199,25 @@ def uses(state: FilterState, slot: int, source: int, params: Parameters) -> bool
 def weigh(state: FilterState, slot: int, own: float, main: float) -> None:
     """Bayes' rule for one rival: its likelihood of a reading against the main state's."""
     if own > 0 and main > 0:
-        state.bank[slot, 0] = min(state.bank[slot, 0] * (own / main), MAX_ODDS)
+        state.bank[slot, 0] *= min(own / main, MAX_ODDS)
 
 
 @compiled
-def suspect_receiver(state: FilterState, source: int, before: float, params: Parameters) -> None:
+def suspect_receiver(state: FilterState, source: int, before: float, best: float, params: Parameters) -> None:
     """Follow the health of a GNSS source (D1), whose odds of being biased were `before`: begin a rival that does without
-    the receiver, or weigh it; and one in which the state is wrong, as likely as dead reckoning makes that."""
+    the receiver, or weigh it. A liar explains what it reads no worse than any state that uses it, of which the best one has
+    `best` times the main state's likelihood."""
     odds = odds_of_bias(state.memory[source])
     suspect = position_of(source, params)
     if state.bank[RECEIVER, 0] > 0:
         if state.stamps[SUSPECT] == suspect and before > 0:
-            state.bank[RECEIVER, 0] = min(state.bank[RECEIVER, 0] * (odds / before), MAX_ODDS)
+            state.bank[RECEIVER, 0] *= min(max(odds / before, best), MAX_ODDS)
         return
     if odds < BEGIN or state.memory[source, EXCLUDED] != 0 or suspect < 0:
         return
     state.stamps[SUSPECT] = suspect
     open_slot(state, RECEIVER, min(odds, MAX_ODDS))
-    _suspect_motion(state, min(odds, MAX_ODDS) * BEGIN)
+    _suspect_motion(state, min(odds, MAX_ODDS) / 10)
 
 
 @compiled
@@ -237,34 +254,33 @@ def wrong(state: FilterState, carried: bool) -> float:
 @compiled
 def decide(state: FilterState, params: Parameters) -> None:
     """Give up rivals that have become unlikely, and let one lead where the expected loss is less so."""
-    total = 1.0
+    total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
             hypothesis = state.hypothesis(slot)
             if not is_finite(hypothesis):
                 close_slot(state, slot)
             total += state.bank[slot, 0]
+    state.auxiliary[MAIN_WEIGHT] = max(state.auxiliary[MAIN_WEIGHT] / total, MIN_WEIGHT)
     for slot in range(RIVALS):
-        if 0 < state.bank[slot, 0] < END * total:
-            close_slot(state, slot)
+        state.bank[slot, 0] = state.bank[slot, 0] / total
     inertial = state.hypothesis(INERTIAL)
-    if state.bank[INERTIAL, 0] > 0 and inertial.nominal[INERTIAL_DOUBT] < 0.05:  # it has had its time
-        if state.bank[INERTIAL, 0] < 1:
-            close_slot(state, INERTIAL)
-        if 0 < state.bank[WHEELS, 0] < 1:
-            close_slot(state, WHEELS)
+    young = state.bank[INERTIAL, 0] > 0 and inertial.nominal[INERTIAL_DOUBT] > FRESH
+    for slot in range(RIVALS):
+        if 0 < state.bank[slot, 0] < (END if young else BEGIN / 10):
+            close_slot(state, slot)
     for slot in range(RIVALS):
         odds = state.bank[slot, 0]
         if odds > 0:
-            needed = 1.0
-            against = total - odds
+            needed = LEAD
+            against = 1 - odds
             if slot == RECEIVER:
                 rival = state.hypothesis(RECEIVER)
                 apart, blurred = 1e-9, 0.0
                 for i in range(3):
                     apart += square(rival.nominal[POSITION_E.start + i] - state.nominal[POSITION_E.start + i])
                     blurred += rival.covariance[POSITION.start + i, POSITION.start + i]
-                needed = params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
+                needed *= params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
             elif slot == RETURN:
                 needed = params.spoof_cost / params.dead_reckoning_cost
             if odds >= needed * against:
@@ -315,7 +331,7 @@ def exclude(state: FilterState, suspect: int, excluded: float, params: Parameter
 @compiled
 def mix(state: FilterState) -> None:
     """Make the state the mixture's: its mean and covariance, about the main state (B6)."""
-    total = 1.0
+    total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):
         total += state.bank[slot, 0]
     errors, mean = np.zeros((RIVALS, state.size)), np.zeros(state.size)
@@ -326,8 +342,8 @@ def mix(state: FilterState) -> None:
             mean += state.bank[slot, 0] / total * errors[slot]
     p = state.covariance
     for j in range(state.size):
-        p[j] *= 1 / total
-        p[j] += mean[j] / total * mean
+        p[j] *= state.auxiliary[MAIN_WEIGHT] / total
+        p[j] += mean[j] * (state.auxiliary[MAIN_WEIGHT] / total) * mean
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
             weight = state.bank[slot, 0] / total

@@ -726,9 +726,9 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
         force += portable_square((values[i] - a[(0 + i)]))
         rate += portable_square((values[(3 + i)] - a[(3 + i)]))
     white = (6.0 / (0.0001 if 0.0001 > elapsed else elapsed))
-    _t2 = a[42]
+    _t2 = a[43]
     _t3 = (white * params.noise.accel)
-    _t4 = a[43]
+    _t4 = a[44]
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
@@ -744,7 +744,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     cdef double own_force
     cdef double own_rate
     held = state.stamps[1]
-    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns) or (not (state.auxiliary[44] > inertial_sample__since_last(state, t_ns, params)))):
+    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns) or (not (state.auxiliary[45] > inertial_sample__since_last(state, t_ns, params)))):
         return True
     elapsed = ((t_ns - held) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -784,7 +784,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     t_ns = (<int64_t>row.t_ns)
     held = state.stamps[1]
     if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns)):
-        a[44] = 0.0
+        a[45] = 0.0
         return True
     elapsed, since = ((t_ns - held) * 1e-09), inertial_sample__since_last(state, t_ns, params)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -796,12 +796,12 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     by_rate = inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed)))
     share = (since / (1.0 + since))
     _t2 = (16.0 * own_force)
-    a[42] += (share * ((_t2 if _t2 < force else force) - a[42]))
+    a[43] += (share * ((_t2 if _t2 < force else force) - a[43]))
     _t3 = (16.0 * own_rate)
-    a[43] += (share * ((_t3 if _t3 < rate else rate) - a[43]))
+    a[44] += (share * ((_t3 if _t3 < rate else rate) - a[44]))
     if (not ((by_force > 1) or (by_rate > 1))):
-        _t4 = (a[44] + since)
-        a[44] = (0.15 if 0.15 < _t4 else _t4)
+        _t4 = (a[45] + since)
+        a[45] = (0.15 if 0.15 < _t4 else _t4)
         return True
     row.ratio = (by_rate if by_rate > by_force else by_force)
     for i in range(3):
@@ -811,8 +811,8 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
         else:
             row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
             row.variance[i] = (own_rate / 3)
-    believed = (not (a[44] > since))
-    a[44] = (0.0 if believed else (a[44] - since))
+    believed = (not (a[45] > since))
+    a[45] = (0.0 if believed else (a[45] - since))
     return believed
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
@@ -856,7 +856,7 @@ cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_n
     if (memory[20] > 0):
         odds = 0.0
         for i in range(6):
-            _t1 = state.auxiliary[(55 + i)]
+            _t1 = state.auxiliary[(56 + i)]
             odds = (_t1 if _t1 > odds else odds)
         source_health_blame_frozen(memory, (odds / (1 + odds)))
 
@@ -899,22 +899,22 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
             sensed = 0.0
             for j in range(3):
                 sensed += (turn[((0 + (3 * j)) + i)] * values[(first + j)])
-            moved[i] = fabs((sensed - a[((45 + first) + i)]))
-            a[((45 + first) + i)] = sensed
-            _t1 = a[(53 + kind)]
+            moved[i] = fabs((sensed - a[((46 + first) + i)]))
+            a[((46 + first) + i)] = sensed
+            _t1 = a[(54 + kind)]
             _t2 = fabs(sensed)
-            a[(53 + kind)] = (_t2 if _t2 > _t1 else _t1)
+            a[(54 + kind)] = (_t2 if _t2 > _t1 else _t1)
             if (moved[i] > 1e-09):
                 same = False
-                if ((a[(51 + kind)] == 0) or (moved[i] < a[(51 + kind)])):
-                    a[(51 + kind)] = moved[i]
-        least, lively = (4.0 * a[(51 + kind)]), 0
+                if ((a[(52 + kind)] == 0) or (moved[i] < a[(52 + kind)])):
+                    a[(52 + kind)] = moved[i]
+        least, lively = (4.0 * a[(52 + kind)]), 0
         for i in range(3):
             lively += (1 if (moved[i] > least) else 0)
         for i in range(3):
             k = (first + i)
             changed = (moved[i] > 1e-09)
-            _t3 = a[(55 + k)]
+            _t3 = a[(56 + k)]
             _t4 = 1e-06
             odds = (_t4 if _t4 > _t3 else _t3)
             if changed:
@@ -923,16 +923,16 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
                 odds = (_t6 if _t6 > _t5 else _t5)
             if ((lively - (1 if (moved[i] > least) else 0)) == 2):
                 if (not changed):
-                    _t7 = (1 - a[(61 + k)])
+                    _t7 = (1 - a[(62 + k)])
                     _t8 = (0.3333333333333333 if 0.3333333333333333 > _t7 else _t7)
                     chance = (0.95 if 0.95 < _t8 else _t8)
                     _t9 = (odds / chance)
                     odds = (1000.0 if 1000.0 < _t9 else _t9)
-                a[(61 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(61 + k)]))
-            a[(55 + k)] = odds
+                a[(62 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(62 + k)]))
+            a[(56 + k)] = odds
             if (odds > worst):
                 worst = odds
-                saturated = (fabs(a[(45 + k)]) >= a[(53 + kind)])
+                saturated = (fabs(a[(46 + k)]) >= a[(54 + kind)])
                 place = ((1.0 + k) + (6 if saturated else 0))
     memory[20] = place
     return same
@@ -1060,7 +1060,9 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double ratio
     cdef bint fused
     cdef double _t2
+    cdef double best
     cdef double main
+    cdef double _t3
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
     model = params.models[source]
     values = row.values
@@ -1117,11 +1119,15 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     _t2 = ratio
     row.ratio = _t2
     memory[2] = _t2
+    best = 0.0
+    if ((state.stamps[22] > 0) and heard and (fits > 0)):
+        best = ((0.1 * rivals_unread(seen.variance, weight, m, spread)) / fits)
     if ((state.stamps[22] > 0) and heard):
         main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
-        measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, params)
+        _t3 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, params)
+        best = (_t3 if _t3 > best else best)
     if (by_rivals and (not doubtful)):
-        rivals_suspect_receiver(state, source, before, params)
+        rivals_suspect_receiver(state, source, before, best, params)
         if ((model == 0) and (not fused)):
             measurement__suspect_state(state, source, values, &seen, params)
     if (trusted and heard):
@@ -1137,7 +1143,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
-            state.auxiliary[41] = 0.0
+            state.auxiliary[42] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     return fused
@@ -1168,7 +1174,8 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     elif gnss:
         source_health_look(memory, whitened, m, same)
 
-cdef void measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, Parameters* params) noexcept nogil:
+cdef double measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, Parameters* params) noexcept nogil:
+    cdef double best
     cdef int64_t model
     cdef double* parameter
     cdef Observation seen
@@ -1177,7 +1184,10 @@ cdef void measurement__fuse_rivals(State* state, int64_t source, double* values,
     cdef int64_t slot
     cdef State rival
     cdef int64_t a
+    cdef double prior
     cdef double own
+    cdef double _t1
+    best = 0.0
     model = params.models[source]
     parameter = params.model_parameters + (source) * PARAMETERS
     for slot in range(4):
@@ -1193,9 +1203,41 @@ cdef void measurement__fuse_rivals(State* state, int64_t source, double* values,
                 if (slot == 3):
                     rivals_weigh(state, slot, rivals_unread(seen.variance, weight, seen.m, spread), main)
                 continue
-            own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
+            prior = 1.0
+            if (slot == 0):
+                prior = measurement__widen(&rival, &seen, params.gates[seen.m], across, spread)
+            own = (prior * rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread))
             rivals_weigh(state, slot, own, main)
+            if (main > 0):
+                _t1 = (own / main)
+                best = (_t1 if _t1 > best else best)
             measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
+    return best
+
+cdef double measurement__widen(State* rival, Observation* seen, double gate, double* across, double* spread) noexcept nogil:
+    cdef double prior
+    cdef double scale
+    cdef double whitened[3]
+    cdef int64_t _step
+    cdef double distance
+    cdef int64_t a
+    prior = 1.0
+    scale = 1.0
+    if (not (rival.nominal[31] > 0.05)):
+        return prior
+    for _step in range(5):
+        if (not measurement_update_whiten(spread, seen.innovation, seen.variance, seen.m, whitened)):
+            return prior
+        distance = 0.0
+        for a in range(seen.m):
+            distance += (whitened[a] * whitened[a])
+        if (distance <= gate):
+            return prior
+        rivals_widen(rival, scale)
+        measurement_update_project(rival, seen, across, spread)
+        prior *= 0.3
+        scale *= 4
+    return prior
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
     cdef double odds
@@ -2259,13 +2301,13 @@ cdef double rivals_unread(double* variance, double factor, int64_t m, double* sp
 
 cdef double rivals_lie_variance(int64_t k) noexcept nogil:
     if (3 <= k < 6):
-        return (1.0 * 1.0)
+        return (0.3 * 0.3)
     if (6 <= k < 9):
-        return (0.1 * 0.1)
+        return (0.03 * 0.03)
     if (9 <= k < 12):
-        return (0.1 * 0.1)
+        return (0.03 * 0.03)
     if (12 <= k < 15):
-        return (1.0 * 1.0)
+        return (0.3 * 0.3)
     return 0.0
 
 cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, double* spread, double fits) noexcept nogil:
@@ -2287,11 +2329,11 @@ cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, 
             for k in range(3, 15):
                 widened[(i) * 3 + j] += ((seen.jacobian[(i) * n + k] * rivals_lie_variance(k)) * seen.jacobian[(j) * n + k])
     lied = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, widened)
-    _t1 = a[40]
+    _t1 = a[41]
     _t2 = 1e-06
     _t3 = ((_t2 if _t2 > _t1 else _t1) * (lied / fits))
-    a[40] = (1000000000000.0 if 1000000000000.0 < _t3 else _t3)
-    if (a[40] >= 0.01):
+    a[41] = (1000000000000.0 if 1000000000000.0 < _t3 else _t3)
+    if (a[41] >= 0.01):
         rivals__suspect_motion(state, 0.01)
 
 cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
@@ -2305,15 +2347,26 @@ cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
             rival.covariance[(k) * n + k] += rivals_lie_variance(k)
     if (state.bank[(3) * BLOCK + 0] == 0):
         rivals_open_slot(state, 3, odds)
-    state.auxiliary[40] = 1e-06
+    state.auxiliary[41] = 1e-06
+
+cdef void rivals_widen(State* state, double scale) noexcept nogil:
+    cdef int64_t k
+    for k in range(3, 15):
+        state.covariance[(k) * n + k] += (scale * rivals_lie_variance(k))
 
 cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nogil:
+    cdef double _t1
+    cdef double _t2
     cdef State rival
     cdef int _i
     cdef int64_t k
+    if (state.stamps[22] == 0):
+        state.auxiliary[40] = 1.0
     if (state.bank[(slot) * BLOCK + 0] == 0):
         state.stamps[22] += 1
-    state.bank[(slot) * BLOCK + 0] = odds
+    _t1 = (odds * state.auxiliary[40])
+    _t2 = 1e-100
+    state.bank[(slot) * BLOCK + 0] = (_t2 if _t2 > _t1 else _t1)
     rival = hypothesis_of(state, slot)
     for _i in range(NOMINAL_SIZE):
         rival.nominal[_i] = state.nominal[_i]
@@ -2343,25 +2396,27 @@ cdef bint rivals_uses(State* state, int64_t slot, int64_t source, Parameters* pa
 cdef void rivals_weigh(State* state, int64_t slot, double own, double main) noexcept nogil:
     cdef double _t1
     if ((own > 0) and (main > 0)):
-        _t1 = (state.bank[(slot) * BLOCK + 0] * (own / main))
-        state.bank[(slot) * BLOCK + 0] = (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
+        _t1 = (own / main)
+        state.bank[(slot) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
 
-cdef void rivals_suspect_receiver(State* state, int64_t source, double before, Parameters* params) noexcept nogil:
+cdef void rivals_suspect_receiver(State* state, int64_t source, double before, double best, Parameters* params) noexcept nogil:
     cdef double odds
     cdef int64_t suspect
     cdef double _t1
+    cdef double _t2
     odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
     suspect = rivals_position_of(source, params)
     if (state.bank[(1) * BLOCK + 0] > 0):
         if ((state.stamps[23] == suspect) and (before > 0)):
-            _t1 = (state.bank[(1) * BLOCK + 0] * (odds / before))
-            state.bank[(1) * BLOCK + 0] = (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
+            _t1 = (odds / before)
+            _t2 = (best if best > _t1 else _t1)
+            state.bank[(1) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < _t2 else _t2)
         return
     if ((odds < 0.01) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
         return
     state.stamps[23] = suspect
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
-    rivals__suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) * 0.01))
+    rivals__suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
 
 cdef bint rivals_returns(double distance, int64_t m, Parameters* params) noexcept nogil:
     cdef double odds
@@ -2386,14 +2441,17 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[41] + (0.0001 * (0.0 if 0.0 > since else since)))
+    _t1 = (state.auxiliary[42] + (0.0001 * (0.0 if 0.0 > since else since)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
     cdef double total
     cdef int64_t slot
     cdef State hypothesis
+    cdef double _t1
+    cdef double _t2
     cdef State inertial
+    cdef bint young
     cdef double odds
     cdef double needed
     cdef double against
@@ -2401,34 +2459,35 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
     cdef double apart
     cdef double blurred
     cdef int64_t i
-    total = 1.0
+    total = state.auxiliary[40]
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
             hypothesis = hypothesis_of(state, slot)
             if (not state_is_finite(&hypothesis)):
                 rivals_close_slot(state, slot)
             total += state.bank[(slot) * BLOCK + 0]
+    _t1 = (state.auxiliary[40] / total)
+    _t2 = 1e-100
+    state.auxiliary[40] = (_t2 if _t2 > _t1 else _t1)
     for slot in range(4):
-        if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 * total)):
-            rivals_close_slot(state, slot)
+        state.bank[(slot) * BLOCK + 0] = (state.bank[(slot) * BLOCK + 0] / total)
     inertial = hypothesis_of(state, 0)
-    if ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[31] < 0.05)):
-        if (state.bank[(0) * BLOCK + 0] < 1):
-            rivals_close_slot(state, 0)
-        if (0 < state.bank[(3) * BLOCK + 0] < 1):
-            rivals_close_slot(state, 3)
+    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[31] > 0.05))
+    for slot in range(4):
+        if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 if young else (0.01 / 10))):
+            rivals_close_slot(state, slot)
     for slot in range(4):
         odds = state.bank[(slot) * BLOCK + 0]
         if (odds > 0):
-            needed = 1.0
-            against = (total - odds)
+            needed = 100.0
+            against = (1 - odds)
             if (slot == 1):
                 rival = hypothesis_of(state, 1)
                 apart, blurred = 1e-09, 0.0
                 for i in range(3):
                     apart += portable_square((rival.nominal[(0 + i)] - state.nominal[(0 + i)]))
                     blurred += rival.covariance[((0 + i)) * n + (0 + i)]
-                needed = ((params.dead_reckoning_cost / params.spoof_cost) * sqrt((blurred / apart)))
+                needed *= ((params.dead_reckoning_cost / params.spoof_cost) * sqrt((blurred / apart)))
             elif (slot == 2):
                 needed = (params.spoof_cost / params.dead_reckoning_cost)
             if (odds >= (needed * against)):
@@ -2452,7 +2511,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
     for other in range(4):
         rivals_close_slot(state, other)
     if (slot == 0):
-        state.auxiliary[41] = 0.5
+        state.auxiliary[42] = 0.5
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
@@ -2492,7 +2551,7 @@ cdef void rivals_mix(State* state) noexcept nogil:
     cdef double weight
     cdef double _t3
     cdef double _t4
-    total = 1.0
+    total = state.auxiliary[40]
     for slot in range(4):
         total += state.bank[(slot) * BLOCK + 0]
     memset(errors, 0, 4 * n * sizeof(double))
@@ -2506,10 +2565,10 @@ cdef void rivals_mix(State* state) noexcept nogil:
             axpy(mean, (state.bank[(slot) * BLOCK + 0] / total), errors + (slot) * n)
     p = state.covariance
     for j in range(n):
-        _t2 = (1 / total)
+        _t2 = (state.auxiliary[40] / total)
         for _i in range(n):
             (p + (j) * n)[_i] *= _t2
-        axpy(p + (j) * n, (mean[j] / total), mean)
+        axpy(p + (j) * n, (mean[j] * (state.auxiliary[40] / total)), mean)
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
             weight = (state.bank[(slot) * BLOCK + 0] / total)
