@@ -152,6 +152,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if state.stamps[ALIVE] > 0 and heard:
         main = fits if trusted else rivals.unread(seen.variance, weight, m, spread)
         best = max(best, _fuse_rivals(state, source, values, factor * noisy, weight, main, params))
+        if model == WHEEL_SPEED and state.bank[rivals.WHEELS, 0] > 0:
+            state.bank[rivals.WHEELS, 0] *= min(best, rivals.MAX_ODDS)
     if by_rivals and not doubtful:
         rivals.suspect_receiver(state, source, before, best, params)
         if model == GNSS_POSITION and not fused:
@@ -219,16 +221,12 @@ def _fuse_rivals(
     for slot in range(rivals.RIVALS):
         if state.bank[slot, 0] > 0:
             rival = state.hypothesis(slot)
-            if not observe(rival, model, values, parameter, seen):
+            if not rivals.uses(state, slot, source, params) or not observe(rival, model, values, parameter, seen):
                 continue
             project(rival, seen, across, spread)
             share_noise(rival, seen, parameter)
             for a in range(seen.m):
                 seen.variance[a] *= factor
-            if not rivals.uses(state, slot, source, params):
-                if slot == rivals.WHEELS:
-                    rivals.weigh(state, slot, rivals.unread(seen.variance, weight, seen.m, spread), main)
-                continue
             prior = 1.0
             if slot == rivals.INERTIAL:
                 prior = _widen(rival, seen, params.gates[seen.m], across, spread)

@@ -156,7 +156,7 @@ def likelihoods(memory: Vector, whitened: Vector3, m: int, same: bool) -> tuple[
         square += whitened[a] * whitened[a]
         rest = whitened[a] - memory[BIAS.start + a] * stretch
         off += rest * rest
-    square = min(square, MAX_SQUARE)
+    square, off = min(square, MAX_SQUARE), min(off, MAX_SQUARE)
     outlier = _density(square, OUTLIER_VARIANCE, m)
     good = (1 - OUTLIERS) * _density(square, 1.0, m) + OUTLIERS * outlier
     noisy = (1 - OUTLIERS) * _density(square, NOISY_VARIANCE, m) + OUTLIERS * outlier

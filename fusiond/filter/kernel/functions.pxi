@@ -1126,6 +1126,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
         _t3 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, params)
         best = (_t3 if _t3 > best else best)
+        if ((model == 2) and (state.bank[(3) * BLOCK + 0] > 0)):
+            state.bank[(3) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < best else best)
     if (by_rivals and (not doubtful)):
         rivals_suspect_receiver(state, source, before, best, params)
         if ((model == 0) and (not fused)):
@@ -1193,16 +1195,12 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
             rival = hypothesis_of(state, slot)
-            if (not observations_observe(&rival, model, values, parameter, &seen)):
+            if ((not rivals_uses(state, slot, source, params)) or (not observations_observe(&rival, model, values, parameter, &seen))):
                 continue
             measurement_update_project(&rival, &seen, across, spread)
             measurement_share_noise(&rival, &seen, parameter)
             for a in range(seen.m):
                 seen.variance[a] *= factor
-            if (not rivals_uses(state, slot, source, params)):
-                if (slot == 3):
-                    rivals_weigh(state, slot, rivals_unread(seen.variance, weight, seen.m, spread), main)
-                continue
             prior = 1.0
             if (slot == 0):
                 prior = measurement__widen(&rival, &seen, params.gates[seen.m], across, spread)
@@ -2676,7 +2674,7 @@ cdef (double, double, double, double) source_health_likelihoods(double* memory, 
         square += (whitened[a] * whitened[a])
         rest = (whitened[a] - (memory[(8 + a)] * stretch))
         off += (rest * rest)
-    square = (1000.0 if 1000.0 < square else square)
+    square, off = (1000.0 if 1000.0 < square else square), (1000.0 if 1000.0 < off else off)
     outlier = source_health__density(square, 100.0, m)
     good = (((1 - 0.01) * source_health__density(square, 1.0, m)) + (0.01 * outlier))
     noisy = (((1 - 0.01) * source_health__density(square, 16.0, m)) + (0.01 * outlier))
@@ -3276,10 +3274,10 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
         (x + 6)[_i] = _t12[_i]
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
     doubt = x[31]
-    strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 1.0)), (noise.gyro + (doubt * 0.01)), noise)
+    strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 0.01)), (noise.gyro + (doubt * 0.0001)), noise)
     if (doubt > 0):
         for i in range(3):
-            state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.01) * dt)
+            state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.0001) * dt)
         x[31] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
 
 cdef void strapdown_gravity_gradient(double* position_e, double* out) noexcept nogil:
