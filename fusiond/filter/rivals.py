@@ -60,7 +60,7 @@ HONEST_AGAIN = 0.02  # odds that a receiver that lied is right again
 MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
 LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
-LIE_SPEED = 0.3  # m/s, by which the velocity may be off
+LIE_SPEED = 0.05  # m/s, by which the velocity may be off
 LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
 FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
 WIDENINGS = 5  # by a factor of 4 in variance each
@@ -124,7 +124,7 @@ def watch_inertial(state: FilterState, seen: Observation, factor: float, spread:
     """Weigh the hypothesis that the inertial sensor lied a moment ago by one observation, of likelihood `fits` under the
     main state: Shiryaev's odds of a change. When they are worth it, the rival begins."""
     a = state.auxiliary
-    if state.bank[INERTIAL, 0] > 0 or state.nominal[INERTIAL_DOUBT] > 0.3 or not fits > 0:
+    if state.bank[INERTIAL, 0] > 0 or not fits > 0:
         return
     widened = np.empty((3, 3))
     for i in range(seen.m):
@@ -190,7 +190,7 @@ def uses(state: FilterState, slot: int, source: int, params: Parameters) -> bool
     if suspect >= 0 and (source == suspect or source == int(params.model_parameters[suspect, COMPANION])):
         if slot == RECEIVER:
             return False
-        if slot == RETURN:
+        if slot == RETURN or slot == INERTIAL:
             return True
     return state.memory[source, EXCLUDED] == 0
 
@@ -266,8 +266,9 @@ def decide(state: FilterState, params: Parameters) -> None:
         state.bank[slot, 0] = state.bank[slot, 0] / total
     inertial = state.hypothesis(INERTIAL)
     young = state.bank[INERTIAL, 0] > 0 and inertial.nominal[INERTIAL_DOUBT] > FRESH
+    excluded = state.memory[int(state.stamps[SUSPECT]), EXCLUDED] != 0
     for slot in range(RIVALS):
-        if 0 < state.bank[slot, 0] < (END if young else BEGIN / 10):
+        if 0 < state.bank[slot, 0] < (END if young or (excluded and slot == INERTIAL) else BEGIN / 10):
             close_slot(state, slot)
     for slot in range(RIVALS):
         odds = state.bank[slot, 0]
@@ -296,8 +297,10 @@ def _lead(state: FilterState, slot: int, params: Parameters) -> None:
     state.nominal[:] = rival.nominal
     for k in range(state.size):
         state.covariance[k] = rival.covariance[k]
+    state.auxiliary[MAIN_WEIGHT] = state.bank[slot, 0]
     for other in range(RIVALS):
-        close_slot(state, other)
+        if not (slot == RECEIVER and other == INERTIAL):  # which may explain in time what the receiver says
+            close_slot(state, other)
     if slot == INERTIAL:
         state.auxiliary[STATE_DOUBT] = WRONG_AFTER_LIE
         count_reset(state, ResetReason.INERTIAL_LIED)

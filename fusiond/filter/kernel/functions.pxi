@@ -2299,7 +2299,7 @@ cdef double rivals_unread(double* variance, double factor, int64_t m, double* sp
 
 cdef double rivals_lie_variance(int64_t k) noexcept nogil:
     if (3 <= k < 6):
-        return (0.3 * 0.3)
+        return (0.05 * 0.05)
     if (6 <= k < 9):
         return (0.03 * 0.03)
     if (9 <= k < 12):
@@ -2319,7 +2319,7 @@ cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, 
     cdef double _t2
     cdef double _t3
     a = state.auxiliary
-    if ((state.bank[(0) * BLOCK + 0] > 0) or (state.nominal[31] > 0.3) or (not (fits > 0))):
+    if ((state.bank[(0) * BLOCK + 0] > 0) or (not (fits > 0))):
         return
     for i in range(seen.m):
         for j in range(seen.m):
@@ -2387,7 +2387,7 @@ cdef bint rivals_uses(State* state, int64_t slot, int64_t source, Parameters* pa
     if ((suspect >= 0) and ((source == suspect) or (source == (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))))):
         if (slot == 1):
             return False
-        if (slot == 2):
+        if ((slot == 2) or (slot == 0)):
             return True
     return (state.memory[(source) * MEMORY_SIZE + 18] == 0)
 
@@ -2450,6 +2450,7 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
     cdef double _t2
     cdef State inertial
     cdef bint young
+    cdef bint excluded
     cdef double odds
     cdef double needed
     cdef double against
@@ -2471,8 +2472,9 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
         state.bank[(slot) * BLOCK + 0] = (state.bank[(slot) * BLOCK + 0] / total)
     inertial = hypothesis_of(state, 0)
     young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[31] > 0.05))
+    excluded = (state.memory[((<int64_t>(state.stamps[23]))) * MEMORY_SIZE + 18] != 0)
     for slot in range(4):
-        if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 if young else (0.01 / 10))):
+        if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 if (young or (excluded and (slot == 0))) else (0.01 / 10))):
             rivals_close_slot(state, slot)
     for slot in range(4):
         odds = state.bank[(slot) * BLOCK + 0]
@@ -2506,8 +2508,10 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
     for k in range(n):
         for _i in range(n):
             (state.covariance + (k) * n)[_i] = (rival.covariance + (k) * n)[_i]
+    state.auxiliary[40] = state.bank[(slot) * BLOCK + 0]
     for other in range(4):
-        rivals_close_slot(state, other)
+        if (not ((slot == 1) and (other == 0))):
+            rivals_close_slot(state, other)
     if (slot == 0):
         state.auxiliary[42] = 0.5
         state_count_reset(state, 6)
