@@ -26,7 +26,6 @@ from fusiond.filter.state import (
     ALIVE,
     BIASED,
     EXCLUDED,
-    INERTIAL_DOUBT,
     HEIGHT_OFFSET,
     HEIGHT_OFFSET_ERROR,
     LAST_RATIO,
@@ -43,7 +42,7 @@ from fusiond.filter.state import (
     T_REJECTED,
     FilterState,
 )
-from fusiond.maths.typed import ErrorRows3, Matrix3, Stamps, Vector, Vector3, compiled
+from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
 from fusiond.maths.wgs84 import mat_ne
 
 OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
@@ -202,6 +201,9 @@ def _judge(
         return
     if not gnss and state.stamps[ALIVE] > 0:
         return
+    if model == WHEEL_SPEED and not carried(state, memory[LAST_SPEED], params) and rivals.wheels_contradict(state, params):
+        rivals.suspect_motion(state, rivals.BEGIN)
+        return
     if source_health.is_due(stamps, t_ns, correlation):
         source_health.judge(memory, stamps, whitened, m, same, t_ns)
     elif gnss:
@@ -227,37 +229,14 @@ def _fuse_rivals(
             share_noise(rival, seen, parameter)
             for a in range(seen.m):
                 seen.variance[a] *= factor
-            prior = 1.0
+            own = rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             if slot == rivals.INERTIAL:
-                prior = _widen(rival, seen, params.gates[seen.m], across, spread)
-            own = prior * rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
+                own = rivals.fit_lie(rival, seen, weight, across, spread, own)
             rivals.weigh(state, slot, own, main)
             if main > 0:
                 best = max(best, own / main)
             update_projected(rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread)
     return best
-
-
-@compiled
-def _widen(rival: FilterState, seen: Observation, gate: float, across: ErrorRows3, spread: Matrix3) -> float:
-    """Widen the rival in which the inertial sensor lied until it explains a reading, while that is fresh. Returns how much
-    less likely the larger lies are, all together."""
-    prior, scale, whitened = 1.0, 1.0, np.empty(3)
-    if not rival.nominal[INERTIAL_DOUBT] > rivals.FRESH:
-        return prior
-    for _step in range(rivals.WIDENINGS):
-        if not whiten(spread, seen.innovation, seen.variance, seen.m, whitened):
-            return prior
-        distance = 0.0
-        for a in range(seen.m):
-            distance += whitened[a] * whitened[a]
-        if distance <= gate:
-            return prior
-        rivals.widen(rival, scale)
-        project(rival, seen, across, spread)
-        prior *= rivals.LARGER
-        scale *= 4
-    return prior
 
 
 @compiled

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from fusiond.filter.measurement_update import CLUTTER_DENSITY, cholesky, difference, inject, whiten
+from fusiond.filter.measurement_update import CLUTTER_DENSITY, cholesky, difference, inject, project, whiten
 from fusiond.filter.observations import GNSS_POSITION, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
 from fusiond.filter.parameters import Parameters
@@ -29,12 +29,14 @@ from fusiond.filter.state import (
     GYRO_BIAS,
     INERTIAL_DOUBT,
     INERTIAL_ODDS,
+    LAST_RATIO,
     MAIN_WEIGHT,
     POSITION,
     POSITION_E,
     RESET_SOURCE,
     STATE_DOUBT,
     SUSPECT,
+    T_LAST,
     T_POSITION,
     VELOCITY,
     FilterState,
@@ -45,7 +47,7 @@ from fusiond.filter.state import (
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
-from fusiond.maths.typed import Matrix3, Vector3, compiled
+from fusiond.maths.typed import ErrorRows3, Matrix3, Vector3, compiled
 
 RIVALS = 4
 INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while the filter runs
@@ -62,9 +64,11 @@ LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned th
 LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
 LIE_SPEED = 0.05  # m/s, by which the velocity may be off
 LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
+WHEEL_FRESH_NS = 500_000_000  # a wheel silent for longer says nothing
 FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
-WIDENINGS = 5  # by a factor of 4 in variance each
-LARGER = 0.3  # chance that a lie is as much larger
+FIRST = 0.1  # of these variances, that a lie has for certain
+LARGER = 0.1  # chance that a lie is larger than that
+LARGEST = 100.0  # and at most by this factor, in variance
 WRONG_RATE = 1e-4  # 1/s: how often dead reckoning goes wrong unnoticed
 MAX_WRONG = 0.9
 WRONG_AFTER_LIE = 0.5  # probability that the position is wrong after the inertial sensor lied
@@ -127,36 +131,86 @@ def watch_inertial(state: FilterState, seen: Observation, factor: float, spread:
     if state.bank[INERTIAL, 0] > 0 or not fits > 0:
         return
     widened = np.empty((3, 3))
-    for i in range(seen.m):
-        for j in range(seen.m):
-            widened[i, j] = spread[i, j]
-            for k in range(VELOCITY.start, ACCEL_BIAS.stop):
-                widened[i, j] += seen.jacobian[i, k] * lie_variance(k) * seen.jacobian[j, k]
+    with_lie(seen, spread, FIRST, widened)
     lied = likelihood(seen.innovation, seen.variance, factor, seen.m, widened)
     a[INERTIAL_ODDS] = min(max(a[INERTIAL_ODDS], LEAST_ODDS) * (lied / fits), MAX_ODDS)
     if a[INERTIAL_ODDS] >= BEGIN:
-        _suspect_motion(state, BEGIN)
+        suspect_motion(state, BEGIN)
 
 
 @compiled
-def _suspect_motion(state: FilterState, odds: float) -> None:
+def suspect_motion(state: FilterState, odds: float) -> None:
     """Begin the rivals in which the inertial sensor lied, and in which all wheels do, where they are not there yet."""
     if state.bank[INERTIAL, 0] == 0:
         open_slot(state, INERTIAL, odds)
         rival = state.hypothesis(INERTIAL)
         rival.nominal[INERTIAL_DOUBT] = 1.0
         for k in range(VELOCITY.start, ACCEL_BIAS.stop):
-            rival.covariance[k, k] += lie_variance(k)
+            rival.covariance[k, k] += FIRST * lie_variance(k)
     if state.bank[WHEELS, 0] == 0:
         open_slot(state, WHEELS, odds)
     state.auxiliary[INERTIAL_ODDS] = LEAST_ODDS
 
 
 @compiled
-def widen(state: FilterState, scale: float) -> None:
-    """Take the lie of the inertial sensor as larger: a state that does not explain a reading yet may after all."""
+def with_lie(seen: Observation, spread: Matrix3, scale: float, widened: Matrix3) -> None:
+    """Write `spread`, H P H' (m, m), with `scale` times the variance of a lie in P, into `widened`."""
+    for i in range(seen.m):
+        for j in range(seen.m):
+            widened[i, j] = spread[i, j]
+            for k in range(VELOCITY.start, ACCEL_BIAS.stop):
+                widened[i, j] += scale * (seen.jacobian[i, k] * lie_variance(k) * seen.jacobian[j, k])
+
+
+@compiled
+def fit_lie(
+    rival: FilterState, seen: Observation, factor: float, across: ErrorRows3, spread: Matrix3, fits: float
+) -> float:
+    """Let the rival in which the inertial sensor lied take the lie that explains an observation best, delta = Lambda H'
+    (S + H Lambda H')^-1 d, as an uncertainty of that size, if that makes it likelier and the lie is fresh. `across` and
+    `spread`, H P and H P H', become those of P + delta delta'. Returns its likelihood, which was `fits`."""
+    m, widened, lower, lie, off = seen.m, np.empty((3, 3)), np.empty((3, 3)), np.zeros(rival.size), np.zeros(3)
+    with_lie(seen, spread, LARGEST, widened)
+    solved = np.empty(3)
+    if not rival.nominal[INERTIAL_DOUBT] > FRESH or not cholesky(widened, seen.variance, factor, m, lower):
+        return fits
+    for a in range(m):
+        solved[a] = seen.innovation[a]
+        for b in range(a):
+            solved[a] -= lower[a, b] * solved[b]
+        solved[a] /= lower[a, a]
+    for a in range(m - 1, -1, -1):
+        for b in range(a + 1, m):
+            solved[a] -= lower[b, a] * solved[b]
+        solved[a] /= lower[a, a]
     for k in range(VELOCITY.start, ACCEL_BIAS.stop):
-        state.covariance[k, k] += scale * lie_variance(k)
+        for a in range(m):
+            lie[k] += LARGEST * lie_variance(k) * seen.jacobian[a, k] * solved[a]
+        for a in range(m):
+            off[a] += seen.jacobian[a, k] * lie[k]
+    for a in range(m):
+        for b in range(m):
+            widened[a, b] = spread[a, b] + off[a] * off[b]
+    larger = LARGER * likelihood(seen.innovation, seen.variance, factor, m, widened)
+    if not larger > fits:
+        return fits
+    for k in range(VELOCITY.start, ACCEL_BIAS.stop):
+        rival.covariance[k] += lie[k] * lie
+    mirror(rival.covariance)
+    project(rival, seen, across, spread)
+    return larger
+
+
+@compiled
+def wheels_contradict(state: FilterState, params: Parameters) -> bool:
+    """Whether most of the wheels that were heard lately contradict the main state: then it is not one of them that lies."""
+    heard = against = 0
+    for i in params.wheels:
+        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS:
+            heard += 1
+            if state.memory[i, LAST_RATIO] > 1:
+                against += 1
+    return 2 * against > heard
 
 
 @compiled
@@ -217,7 +271,7 @@ def suspect_receiver(state: FilterState, source: int, before: float, best: float
         return
     state.stamps[SUSPECT] = suspect
     open_slot(state, RECEIVER, min(odds, MAX_ODDS))
-    _suspect_motion(state, min(odds, MAX_ODDS) / 10)
+    suspect_motion(state, min(odds, MAX_ODDS) / 10)
 
 
 @compiled

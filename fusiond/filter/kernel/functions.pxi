@@ -1171,6 +1171,9 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
         return
     if ((not gnss) and (state.stamps[22] > 0)):
         return
+    if ((model == 2) and (not motion_constraints_carried(state, memory[0], params)) and rivals_wheels_contradict(state, params)):
+        rivals_suspect_motion(state, 0.01)
+        return
     if source_health_is_due(stamps, t_ns, correlation):
         source_health_judge(memory, stamps, whitened, m, same, t_ns)
     elif gnss:
@@ -1186,7 +1189,6 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
     cdef int64_t slot
     cdef State rival
     cdef int64_t a
-    cdef double prior
     cdef double own
     cdef double _t1
     best = 0.0
@@ -1201,41 +1203,15 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
             measurement_share_noise(&rival, &seen, parameter)
             for a in range(seen.m):
                 seen.variance[a] *= factor
-            prior = 1.0
+            own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             if (slot == 0):
-                prior = measurement__widen(&rival, &seen, params.gates[seen.m], across, spread)
-            own = (prior * rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread))
+                own = rivals_fit_lie(&rival, &seen, weight, across, spread, own)
             rivals_weigh(state, slot, own, main)
             if (main > 0):
                 _t1 = (own / main)
                 best = (_t1 if _t1 > best else best)
             measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
     return best
-
-cdef double measurement__widen(State* rival, Observation* seen, double gate, double* across, double* spread) noexcept nogil:
-    cdef double prior
-    cdef double scale
-    cdef double whitened[3]
-    cdef int64_t _step
-    cdef double distance
-    cdef int64_t a
-    prior = 1.0
-    scale = 1.0
-    if (not (rival.nominal[31] > 0.05)):
-        return prior
-    for _step in range(5):
-        if (not measurement_update_whiten(spread, seen.innovation, seen.variance, seen.m, whitened)):
-            return prior
-        distance = 0.0
-        for a in range(seen.m):
-            distance += (whitened[a] * whitened[a])
-        if (distance <= gate):
-            return prior
-        rivals_widen(rival, scale)
-        measurement_update_project(rival, seen, across, spread)
-        prior *= 0.3
-        scale *= 4
-    return prior
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
     cdef double odds
@@ -2311,9 +2287,6 @@ cdef double rivals_lie_variance(int64_t k) noexcept nogil:
 cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, double* spread, double fits) noexcept nogil:
     cdef double* a
     cdef double widened[3 * 3]
-    cdef int64_t i
-    cdef int64_t j
-    cdef int64_t k
     cdef double lied
     cdef double _t1
     cdef double _t2
@@ -2321,20 +2294,16 @@ cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, 
     a = state.auxiliary
     if ((state.bank[(0) * BLOCK + 0] > 0) or (not (fits > 0))):
         return
-    for i in range(seen.m):
-        for j in range(seen.m):
-            widened[(i) * 3 + j] = spread[(i) * 3 + j]
-            for k in range(3, 15):
-                widened[(i) * 3 + j] += ((seen.jacobian[(i) * n + k] * rivals_lie_variance(k)) * seen.jacobian[(j) * n + k])
+    rivals_with_lie(seen, spread, 0.1, widened)
     lied = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, widened)
     _t1 = a[41]
     _t2 = 1e-06
     _t3 = ((_t2 if _t2 > _t1 else _t1) * (lied / fits))
     a[41] = (1000000000000.0 if 1000000000000.0 < _t3 else _t3)
     if (a[41] >= 0.01):
-        rivals__suspect_motion(state, 0.01)
+        rivals_suspect_motion(state, 0.01)
 
-cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
+cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     cdef State rival
     cdef int64_t k
     if (state.bank[(0) * BLOCK + 0] == 0):
@@ -2342,15 +2311,80 @@ cdef void rivals__suspect_motion(State* state, double odds) noexcept nogil:
         rival = hypothesis_of(state, 0)
         rival.nominal[31] = 1.0
         for k in range(3, 15):
-            rival.covariance[(k) * n + k] += rivals_lie_variance(k)
+            rival.covariance[(k) * n + k] += (0.1 * rivals_lie_variance(k))
     if (state.bank[(3) * BLOCK + 0] == 0):
         rivals_open_slot(state, 3, odds)
     state.auxiliary[41] = 1e-06
 
-cdef void rivals_widen(State* state, double scale) noexcept nogil:
+cdef void rivals_with_lie(Observation* seen, double* spread, double scale, double* widened) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t j
     cdef int64_t k
+    for i in range(seen.m):
+        for j in range(seen.m):
+            widened[(i) * 3 + j] = spread[(i) * 3 + j]
+            for k in range(3, 15):
+                widened[(i) * 3 + j] += (scale * ((seen.jacobian[(i) * n + k] * rivals_lie_variance(k)) * seen.jacobian[(j) * n + k]))
+
+cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, double* across, double* spread, double fits) noexcept nogil:
+    cdef int64_t m
+    cdef double widened[3 * 3]
+    cdef double lower[3 * 3]
+    cdef double lie[n]
+    cdef double off[3]
+    cdef double solved[3]
+    cdef int64_t a
+    cdef int64_t b
+    cdef int64_t k
+    cdef double larger
+    m = seen.m
+    memset(lie, 0, n * sizeof(double))
+    memset(off, 0, 3 * sizeof(double))
+    rivals_with_lie(seen, spread, 100.0, widened)
+    if ((not (rival.nominal[31] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, factor, m, lower))):
+        return fits
+    for a in range(m):
+        solved[a] = seen.innovation[a]
+        for b in range(a):
+            solved[a] -= (lower[(a) * 3 + b] * solved[b])
+        solved[a] /= lower[(a) * 3 + a]
+    for a in range((m - 1), (-1), (-1)):
+        for b in range((a + 1), m):
+            solved[a] -= (lower[(b) * 3 + a] * solved[b])
+        solved[a] /= lower[(a) * 3 + a]
     for k in range(3, 15):
-        state.covariance[(k) * n + k] += (scale * rivals_lie_variance(k))
+        for a in range(m):
+            lie[k] += (((100.0 * rivals_lie_variance(k)) * seen.jacobian[(a) * n + k]) * solved[a])
+        for a in range(m):
+            off[a] += (seen.jacobian[(a) * n + k] * lie[k])
+    for a in range(m):
+        for b in range(m):
+            widened[(a) * 3 + b] = (spread[(a) * 3 + b] + (off[a] * off[b]))
+    larger = (0.1 * rivals_likelihood(seen.innovation, seen.variance, factor, m, widened))
+    if (not (larger > fits)):
+        return fits
+    for k in range(3, 15):
+        axpy(rival.covariance + (k) * n, lie[k], lie)
+    linear_mirror(rival.covariance)
+    measurement_update_project(rival, seen, across, spread)
+    return larger
+
+cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept nogil:
+    cdef int64_t _t1
+    cdef int64_t heard
+    cdef int64_t against
+    cdef int64_t i
+    cdef int64_t _k2
+    _t1 = 0
+    heard = _t1
+    against = _t1
+    for _k2 in range(params.wheels_count):
+        i = params.wheels[_k2]
+        if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
+            heard += 1
+            if (state.memory[(i) * MEMORY_SIZE + 2] > 1):
+                against += 1
+    return ((2 * against) > heard)
 
 cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nogil:
     cdef double _t1
@@ -2414,7 +2448,7 @@ cdef void rivals_suspect_receiver(State* state, int64_t source, double before, d
         return
     state.stamps[23] = suspect
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
-    rivals__suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
+    rivals_suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
 
 cdef bint rivals_returns(double distance, int64_t m, Parameters* params) noexcept nogil:
     cdef double odds
