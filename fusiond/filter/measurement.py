@@ -150,7 +150,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         best = rivals.SHARE_OF_LIAR * rivals.unread(seen.variance, weight, m, spread) / fits
     if state.stamps[ALIVE] > 0 and heard:
         main = fits if trusted else rivals.unread(seen.variance, weight, m, spread)
-        best = max(best, _fuse_rivals(state, source, values, factor * noisy, weight, main, params))
+        gained = source_health.odds_of_bias(memory) / before if model == GNSS_VELOCITY and before > 0 else 0.0
+        best = max(best, _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params))
         if model == WHEEL_SPEED and state.bank[rivals.WHEELS, 0] > 0:
             state.bank[rivals.WHEELS, 0] *= min(best, rivals.MAX_ODDS)
     if by_rivals and not doubtful:
@@ -212,10 +213,18 @@ def _judge(
 
 @compiled
 def _fuse_rivals(
-    state: FilterState, source: int, values: Vector, factor: float, weight: float, main: float, params: Parameters
+    state: FilterState,
+    source: int,
+    values: Vector,
+    factor: float,
+    weight: float,
+    main: float,
+    gained: float,
+    params: Parameters,
 ) -> float:
-    """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them. Returns the best
-    likelihood of those that use it, over that of the main state."""
+    """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them. Where the health of a
+    receiver made it likelier by `gained` that it is biased against the main state, those that agree with it gain as much.
+    Returns the best likelihood of those that use it, over that of the main state."""
     best = 0.0
     model, parameter = params.models[source], params.model_parameters[source]
     seen = Observation(state.size)
@@ -232,10 +241,14 @@ def _fuse_rivals(
             own = rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             if slot == rivals.INERTIAL:
                 own = rivals.fit_lie(rival, seen, weight, across, spread, own)
+            ratio, _fused = update_projected(
+                rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread
+            )
+            if slot == rivals.INERTIAL and ratio <= 1:
+                own = max(own, gained * main)
             rivals.weigh(state, slot, own, main)
             if main > 0:
                 best = max(best, own / main)
-            update_projected(rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread)
     return best
 
 

@@ -67,7 +67,8 @@ LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
 WHEEL_FRESH_NS = 500_000_000  # a wheel silent for longer says nothing
 FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
 FIRST = 0.1  # of these variances, that a lie has for certain
-LARGER = 0.1  # chance that a lie is larger than that
+LARGER = 0.3  # chance that a lie is larger than that
+GOES_ON = 10.0  # of these variances, that a large one has from then on
 LARGEST = 100.0  # and at most by this factor, in variance
 WRONG_RATE = 1e-4  # 1/s: how often dead reckoning goes wrong unnoticed
 MAX_WRONG = 0.9
@@ -196,6 +197,8 @@ def fit_lie(
         return fits
     for k in range(VELOCITY.start, ACCEL_BIAS.stop):
         rival.covariance[k] += lie[k] * lie
+    for k in range(GYRO_BIAS.start, ACCEL_BIAS.stop):  # it may go on, which shows as a bias
+        rival.covariance[k, k] = max(rival.covariance[k, k], GOES_ON * lie_variance(k))
     mirror(rival.covariance)
     project(rival, seen, across, spread)
     return larger

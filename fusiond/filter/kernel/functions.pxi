@@ -1062,6 +1062,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double _t2
     cdef double best
     cdef double main
+    cdef double gained
     cdef double _t3
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
     model = params.models[source]
@@ -1124,7 +1125,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         best = ((0.1 * rivals_unread(seen.variance, weight, m, spread)) / fits)
     if ((state.stamps[22] > 0) and heard):
         main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
-        _t3 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, params)
+        gained = ((source_health_odds_of_bias(memory) / before) if ((model == 1) and (before > 0)) else 0.0)
+        _t3 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
         best = (_t3 if _t3 > best else best)
         if ((model == 2) and (state.bank[(3) * BLOCK + 0] > 0)):
             state.bank[(3) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < best else best)
@@ -1179,7 +1181,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     elif gnss:
         source_health_look(memory, whitened, m, same)
 
-cdef double measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, Parameters* params) noexcept nogil:
+cdef double measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, double gained, Parameters* params) noexcept nogil:
     cdef double best
     cdef int64_t model
     cdef double* parameter
@@ -1190,7 +1192,11 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
     cdef State rival
     cdef int64_t a
     cdef double own
-    cdef double _t1
+    cdef (double, bint) _t1
+    cdef double ratio
+    cdef bint _fused
+    cdef double _t2
+    cdef double _t3
     best = 0.0
     model = params.models[source]
     parameter = params.model_parameters + (source) * PARAMETERS
@@ -1206,11 +1212,16 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
             own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             if (slot == 0):
                 own = rivals_fit_lie(&rival, &seen, weight, across, spread, own)
+            _t1 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
+            ratio = _t1[0]
+            _fused = _t1[1]
+            if ((slot == 0) and (ratio <= 1)):
+                _t2 = (gained * main)
+                own = (_t2 if _t2 > own else own)
             rivals_weigh(state, slot, own, main)
             if (main > 0):
-                _t1 = (own / main)
-                best = (_t1 if _t1 > best else best)
-            measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
+                _t3 = (own / main)
+                best = (_t3 if _t3 > best else best)
     return best
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
@@ -2337,6 +2348,8 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, doubl
     cdef int64_t b
     cdef int64_t k
     cdef double larger
+    cdef double _t1
+    cdef double _t2
     m = seen.m
     memset(lie, 0, n * sizeof(double))
     memset(off, 0, 3 * sizeof(double))
@@ -2360,11 +2373,15 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, doubl
     for a in range(m):
         for b in range(m):
             widened[(a) * 3 + b] = (spread[(a) * 3 + b] + (off[a] * off[b]))
-    larger = (0.1 * rivals_likelihood(seen.innovation, seen.variance, factor, m, widened))
+    larger = (0.3 * rivals_likelihood(seen.innovation, seen.variance, factor, m, widened))
     if (not (larger > fits)):
         return fits
     for k in range(3, 15):
         axpy(rival.covariance + (k) * n, lie[k], lie)
+    for k in range(9, 15):
+        _t1 = rival.covariance[(k) * n + k]
+        _t2 = (10.0 * rivals_lie_variance(k))
+        rival.covariance[(k) * n + k] = (_t2 if _t2 > _t1 else _t1)
     linear_mirror(rival.covariance)
     measurement_update_project(rival, seen, across, spread)
     return larger
