@@ -619,76 +619,89 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
-cdef double inertial_sample_ratio_of(double change, double own, double blow) noexcept nogil:
-    return (change / ((36.0 * own) + portable_square(blow)))
+cdef (double, double) inertial_sample_ratios(double force, double rate, double own_force, double own_rate, double elapsed) noexcept nogil:
+    cdef double swing
+    cdef double by_force
+    swing = (0.1 if 0.1 < elapsed else elapsed)
+    by_force = (force / ((36.0 * own_force) + portable_square((40.0 + (400.0 * swing)))))
+    return (by_force, (rate / ((36.0 * own_rate) + portable_square((1.0 + (20.0 * swing))))))
+
+cdef double inertial_sample_since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
+    cdef int64_t last
+    last = state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0]
+    if ((state.stamps[1] == (<int64_t>-4611686018427387904)) or (last == (<int64_t>-4611686018427387904)) or ((t_ns - last) > params.imu_gap_ns)):
+        return INFINITY
+    return ((t_ns - last) * 1e-09)
 
 cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
-    cdef int64_t held
     cdef double elapsed
     cdef (double, double, double, double) _t1
     cdef double force
     cdef double rate
     cdef double own_force
     cdef double own_rate
-    held = state.stamps[1]
-    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns) or (not (state.auxiliary[41] > inertial_sample__since_last(state, t_ns, params)))):
+    cdef (double, double) _t2
+    cdef double by_force
+    cdef double by_rate
+    if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
+        return False
+    if (not (state.auxiliary[41] > inertial_sample_since_last(state, t_ns, params))):
         return True
-    elapsed = ((t_ns - held) * 1e-09)
+    elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
     force = _t1[0]
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    if (inertial_sample_ratio_of(force, own_force, (40.0 + (400.0 * elapsed))) > 1):
-        return False
-    return (not (inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed))) > 1))
-
-cdef double inertial_sample__since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
-    return ((t_ns - state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0]) * 1e-09)
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, elapsed)
+    by_force = _t2[0]
+    by_rate = _t2[1]
+    return (not ((by_force > 1) or (by_rate > 1)))
 
 cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef double* a
     cdef double* values
     cdef int64_t t_ns
-    cdef int64_t held
-    cdef double elapsed
     cdef double since
+    cdef double elapsed
     cdef (double, double, double, double) _t1
     cdef double force
     cdef double rate
     cdef double own_force
     cdef double own_rate
+    cdef (double, double) _t2
     cdef double by_force
     cdef double by_rate
     cdef double share
-    cdef double _t2
     cdef double _t3
     cdef double _t4
+    cdef double _t5
     cdef int64_t i
-    cdef bint believed
+    cdef bint outvoted
     a = state.auxiliary
     values = row.values
     t_ns = (<int64_t>row.t_ns)
-    held = state.stamps[1]
-    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns)):
+    since = inertial_sample_since_last(state, t_ns, params)
+    if (since == INFINITY):
         a[41] = 0.0
         return True
-    elapsed, since = ((t_ns - held) * 1e-09), inertial_sample__since_last(state, t_ns, params)
+    elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
     force = _t1[0]
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    by_force = inertial_sample_ratio_of(force, own_force, (40.0 + (400.0 * elapsed)))
-    by_rate = inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed)))
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, elapsed)
+    by_force = _t2[0]
+    by_rate = _t2[1]
     share = (since / (1.0 + since))
-    _t2 = (16.0 * own_force)
-    a[39] += (share * ((_t2 if _t2 < force else force) - a[39]))
-    _t3 = (16.0 * own_rate)
-    a[40] += (share * ((_t3 if _t3 < rate else rate) - a[40]))
+    _t3 = (16.0 * own_force)
+    a[39] += (share * ((_t3 if _t3 < force else force) - a[39]))
+    _t4 = (16.0 * own_rate)
+    a[40] += (share * ((_t4 if _t4 < rate else rate) - a[40]))
     if (not ((by_force > 1) or (by_rate > 1))):
-        _t4 = (a[41] + since)
-        a[41] = (0.15 if 0.15 < _t4 else _t4)
+        _t5 = (a[41] + since)
+        a[41] = (2.0 if 2.0 < _t5 else _t5)
         return True
     row.ratio = (by_rate if by_rate > by_force else by_force)
     for i in range(3):
@@ -698,9 +711,9 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
         else:
             row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
             row.variance[i] = (own_rate / 3)
-    believed = (not (a[41] > since))
-    a[41] = (0.0 if believed else (a[41] - since))
-    return believed
+    outvoted = (not (a[41] > since))
+    a[41] = (0.0 if outvoted else (a[41] - since))
+    return outvoted
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
     cdef int64_t held
@@ -2327,7 +2340,9 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
         return False
     if (phase == 1):
         return (model != 0 and model != 1)
-    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params) and source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
+    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params)):
+        if (not inertial_sample_is_believed(state, row.values, t_ns, params)):
+            return True
         grown = (portable_square(0.3) * ((t_ns - stamps[0]) * 1e-09))
         return (not ((step_yaw_variance(state) + grown) > (portable_square(0.20943951023931956) / 2)))
     return True
