@@ -46,9 +46,8 @@ from fusiond.maths.typed import Vector, compiled
 
 BLOW_RATE = 1.0  # rad/s: what a kerb or a pothole changes a vehicle's angular rate by at once
 BLOW_FORCE = 40.0  # m/s^2: and its specific force
-SWING = 20.0  # rad/s^2: and what tyres, brakes or propellers add to that with time
+SWING = 20.0  # rad/s^2: and what tyres, brakes or propellers add to that in the time between two samples
 JERK = 400.0  # m/s^3: the same of the specific force
-SWING_TIME = 0.1  # s, for how long: no vehicle goes on so
 OWN = 36.0  # a squared change of up to so many times the mean one is the sensor's own scatter
 CLIPPED = 16.0  # a squared change counts in the mean for at most so many times that
 SCATTER_TIME = 1.0  # s, over which the mean is taken
@@ -80,11 +79,11 @@ def compare(state: FilterState, values: Vector, elapsed: float, params: Paramete
 
 
 @compiled
-def ratios(force: float, rate: float, own_force: float, own_rate: float, elapsed: float) -> tuple[float, float]:
-    """Test ratios of the changes of force and rate over `elapsed` [s]: above 1 neither scatter nor physics explain them."""
-    swing = min(elapsed, SWING_TIME)
-    by_force = force / (OWN * own_force + square(BLOW_FORCE + JERK * swing))
-    return by_force, rate / (OWN * own_rate + square(BLOW_RATE + SWING * swing))
+def ratios(force: float, rate: float, own_force: float, own_rate: float, since: float) -> tuple[float, float]:
+    """Test ratios of the changes of force and rate, `since` [s] after the sample before: above 1 neither scatter nor physics
+    explain them."""
+    by_force = force / (OWN * own_force + square(BLOW_FORCE + JERK * since))
+    return by_force, rate / (OWN * own_rate + square(BLOW_RATE + SWING * since))
 
 
 @compiled
@@ -102,11 +101,12 @@ def is_believed(state: FilterState, values: Vector, t_ns: int, params: Parameter
     """Whether a sample, the next one after the newest behind the state, may be used."""
     if not is_trusted(state.memory[params.imu_source]):
         return False
-    if not state.auxiliary[SUPPORT] > since_last(state, t_ns, params):
+    since = since_last(state, t_ns, params)
+    if not state.auxiliary[SUPPORT] > since:
         return True
     elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    by_force, by_rate = ratios(force, rate, own_force, own_rate, elapsed)
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, since)
     return not (by_force > 1 or by_rate > 1)
 
 
@@ -121,24 +121,29 @@ def judge(state: FilterState, row: Row, params: Parameters) -> bool:
         return True
     elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    by_force, by_rate = ratios(force, rate, own_force, own_rate, elapsed)
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, since)
+    agrees = not (by_force > 1 or by_rate > 1)
+    outvoted = not agrees and not a[SUPPORT] > since
+    if not agrees:
+        row["ratio"] = max(by_force, by_rate)
+        for i in range(3):
+            if by_force > by_rate:
+                row["innovation"][i] = values[i] - a[HELD_FORCE_B.start + i]
+                row["variance"][i] = own_force / 3
+            else:
+                row["innovation"][i] = values[3 + i] - a[HELD_RATE_B.start + i]
+                row["variance"][i] = own_rate / 3
+    if not (agrees or outvoted):
+        a[SUPPORT] -= since
+        return False
+    if agrees:
+        a[SUPPORT] = min(a[SUPPORT] + since, SUPPORT_TIME)
+    else:
+        a[SUPPORT] = 0.0
     share = since / (SCATTER_TIME + since)
     a[CHANGE_FORCE] += share * (min(force, CLIPPED * own_force) - a[CHANGE_FORCE])
     a[CHANGE_RATE] += share * (min(rate, CLIPPED * own_rate) - a[CHANGE_RATE])
-    if not (by_force > 1 or by_rate > 1):
-        a[SUPPORT] = min(a[SUPPORT] + since, SUPPORT_TIME)
-        return True
-    row["ratio"] = max(by_force, by_rate)
-    for i in range(3):
-        if by_force > by_rate:
-            row["innovation"][i] = values[i] - a[HELD_FORCE_B.start + i]
-            row["variance"][i] = own_force / 3
-        else:
-            row["innovation"][i] = values[3 + i] - a[HELD_RATE_B.start + i]
-            row["variance"][i] = own_rate / 3
-    outvoted = not a[SUPPORT] > since
-    a[SUPPORT] = 0.0 if outvoted else a[SUPPORT] - since
-    return outvoted
+    return True
 
 
 @compiled

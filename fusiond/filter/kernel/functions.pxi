@@ -619,12 +619,10 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
-cdef (double, double) inertial_sample_ratios(double force, double rate, double own_force, double own_rate, double elapsed) noexcept nogil:
-    cdef double swing
+cdef (double, double) inertial_sample_ratios(double force, double rate, double own_force, double own_rate, double since) noexcept nogil:
     cdef double by_force
-    swing = (0.1 if 0.1 < elapsed else elapsed)
-    by_force = (force / ((36.0 * own_force) + portable_square((40.0 + (400.0 * swing)))))
-    return (by_force, (rate / ((36.0 * own_rate) + portable_square((1.0 + (20.0 * swing))))))
+    by_force = (force / ((36.0 * own_force) + portable_square((40.0 + (400.0 * since)))))
+    return (by_force, (rate / ((36.0 * own_rate) + portable_square((1.0 + (20.0 * since))))))
 
 cdef double inertial_sample_since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef int64_t last
@@ -634,6 +632,7 @@ cdef double inertial_sample_since_last(State* state, int64_t t_ns, Parameters* p
     return ((t_ns - last) * 1e-09)
 
 cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
+    cdef double since
     cdef double elapsed
     cdef (double, double, double, double) _t1
     cdef double force
@@ -645,7 +644,8 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     cdef double by_rate
     if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         return False
-    if (not (state.auxiliary[41] > inertial_sample_since_last(state, t_ns, params))):
+    since = inertial_sample_since_last(state, t_ns, params)
+    if (not (state.auxiliary[41] > since)):
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -653,7 +653,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, elapsed)
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since)
     by_force = _t2[0]
     by_rate = _t2[1]
     return (not ((by_force > 1) or (by_rate > 1)))
@@ -672,12 +672,13 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     cdef (double, double) _t2
     cdef double by_force
     cdef double by_rate
-    cdef double share
+    cdef bint agrees
+    cdef bint outvoted
+    cdef int64_t i
     cdef double _t3
+    cdef double share
     cdef double _t4
     cdef double _t5
-    cdef int64_t i
-    cdef bint outvoted
     a = state.auxiliary
     values = row.values
     t_ns = (<int64_t>row.t_ns)
@@ -691,29 +692,34 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, elapsed)
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since)
     by_force = _t2[0]
     by_rate = _t2[1]
+    agrees = (not ((by_force > 1) or (by_rate > 1)))
+    outvoted = ((not agrees) and (not (a[41] > since)))
+    if (not agrees):
+        row.ratio = (by_rate if by_rate > by_force else by_force)
+        for i in range(3):
+            if (by_force > by_rate):
+                row.innovation[i] = (values[i] - a[(0 + i)])
+                row.variance[i] = (own_force / 3)
+            else:
+                row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
+                row.variance[i] = (own_rate / 3)
+    if (not (agrees or outvoted)):
+        a[41] -= since
+        return False
+    if agrees:
+        _t3 = (a[41] + since)
+        a[41] = (2.0 if 2.0 < _t3 else _t3)
+    else:
+        a[41] = 0.0
     share = (since / (1.0 + since))
-    _t3 = (16.0 * own_force)
-    a[39] += (share * ((_t3 if _t3 < force else force) - a[39]))
-    _t4 = (16.0 * own_rate)
-    a[40] += (share * ((_t4 if _t4 < rate else rate) - a[40]))
-    if (not ((by_force > 1) or (by_rate > 1))):
-        _t5 = (a[41] + since)
-        a[41] = (2.0 if 2.0 < _t5 else _t5)
-        return True
-    row.ratio = (by_rate if by_rate > by_force else by_force)
-    for i in range(3):
-        if (by_force > by_rate):
-            row.innovation[i] = (values[i] - a[(0 + i)])
-            row.variance[i] = (own_force / 3)
-        else:
-            row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
-            row.variance[i] = (own_rate / 3)
-    outvoted = (not (a[41] > since))
-    a[41] = (0.0 if outvoted else (a[41] - since))
-    return outvoted
+    _t4 = (16.0 * own_force)
+    a[39] += (share * ((_t4 if _t4 < force else force) - a[39]))
+    _t5 = (16.0 * own_rate)
+    a[40] += (share * ((_t5 if _t5 < rate else rate) - a[40]))
+    return True
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
     cdef int64_t held
