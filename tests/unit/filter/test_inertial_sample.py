@@ -51,7 +51,7 @@ def from_number(first: int, count: int, bad: Callable[[Array], Array]) -> Change
 
 
 def weaving(duration: float, rate: float = 100.0) -> Drive:
-    return drive(duration, lambda t: 12.0 * ramp(t, 3.0, 6.0), lambda t: 0.6 * np.sin(0.4 * t), rate=rate)
+    return drive(duration, lambda t: 12.0 * ramp(t, 3.0, 6.0), lambda t: 0.3 + 0.6 * np.sin(0.4 * t) * ramp(t, 4.0, 4.0), rate=rate)
 
 
 def place(fusion: Fusion, t_ns: int) -> Array:
