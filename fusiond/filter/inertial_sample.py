@@ -112,8 +112,8 @@ def is_believed(state: FilterState, values: Vector, t_ns: int, params: Parameter
 
 @compiled
 def judge(state: FilterState, row: Row, params: Parameters) -> bool:
-    """Judge a sample of a sensor that is trusted: `is_believed`, and what that changes. One that contradicts the held sample gets ratio, innovation and
-    variance of the accelerometer or the gyro, whichever is further off."""
+    """Judge a sample of a sensor that is trusted: `is_believed`, and what that changes. One that contradicts the held sample
+    gets ratio, innovation and variance of the accelerometer or the gyro, whichever is further off."""
     a, values, t_ns = state.auxiliary, row["values"], int(row["t_ns"])
     since = since_last(state, t_ns, params)
     if since == math.inf:
@@ -122,9 +122,7 @@ def judge(state: FilterState, row: Row, params: Parameters) -> bool:
     elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
     by_force, by_rate = ratios(force, rate, own_force, own_rate, since)
-    agrees = not (by_force > 1 or by_rate > 1)
-    outvoted = not agrees and not a[SUPPORT] > since
-    if not agrees:
+    if by_force > 1 or by_rate > 1:
         row["ratio"] = max(by_force, by_rate)
         for i in range(3):
             if by_force > by_rate:
@@ -133,13 +131,12 @@ def judge(state: FilterState, row: Row, params: Parameters) -> bool:
             else:
                 row["innovation"][i] = values[3 + i] - a[HELD_RATE_B.start + i]
                 row["variance"][i] = own_rate / 3
-    if not (agrees or outvoted):
-        a[SUPPORT] -= since
-        return False
-    if agrees:
-        a[SUPPORT] = min(a[SUPPORT] + since, SUPPORT_TIME)
-    else:
+        if a[SUPPORT] > since:
+            a[SUPPORT] -= since
+            return False
         a[SUPPORT] = 0.0
+    else:
+        a[SUPPORT] = min(a[SUPPORT] + since, SUPPORT_TIME)
     share = since / (SCATTER_TIME + since)
     a[CHANGE_FORCE] += share * (min(force, CLIPPED * own_force) - a[CHANGE_FORCE])
     a[CHANGE_RATE] += share * (min(rate, CLIPPED * own_rate) - a[CHANGE_RATE])
@@ -147,7 +144,9 @@ def judge(state: FilterState, row: Row, params: Parameters) -> bool:
 
 
 @compiled
-def doubt(state: FilterState, values: Vector, t_ns: int, until_ns: int, believed: bool, params: Parameters) -> tuple[float, float]:
+def doubt(
+    state: FilterState, values: Vector, t_ns: int, until_ns: int, believed: bool, params: Parameters
+) -> tuple[float, float]:
     """What interpolation may miss: noise densities of acceleration [(m/s^2)^2/Hz] and rate [(rad/s)^2/Hz] for a piece of the
     interval from the held sample, up to `t_ns`; the next sample is of `until_ns`. None between good samples, one after the
     other.

@@ -1,9 +1,9 @@
 """The order of arrival never changes a bit: any shuffle inside the horizon gives the same state, outcomes and counts.
 
 A case is a few seconds of a drive with everything that makes arrival matter: duplicates, outliers at the gate's edge,
-invalid samples, IMU samples that are missing for longer than it may be silent or that are nonsense, events stamped after
-the newest IMU sample. It is fused in the order of the stamps, and again in a random order of arrival in which no event is later than the
-horizon. Hypothesis draws a seed and the shape of the case, and prints them when a case fails.
+invalid samples, IMU samples that are nonsense, or missing for longer than it may be silent, events stamped after the
+newest IMU sample. It is fused in the order of the stamps, and again in a random order of arrival in which no event is later
+than the horizon. Hypothesis draws a seed and the shape of the case, and prints them when a case fails.
 """
 
 from __future__ import annotations

@@ -672,8 +672,6 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     cdef (double, double) _t2
     cdef double by_force
     cdef double by_rate
-    cdef bint agrees
-    cdef bint outvoted
     cdef int64_t i
     cdef double _t3
     cdef double share
@@ -695,9 +693,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since)
     by_force = _t2[0]
     by_rate = _t2[1]
-    agrees = (not ((by_force > 1) or (by_rate > 1)))
-    outvoted = ((not agrees) and (not (a[41] > since)))
-    if (not agrees):
+    if ((by_force > 1) or (by_rate > 1)):
         row.ratio = (by_rate if by_rate > by_force else by_force)
         for i in range(3):
             if (by_force > by_rate):
@@ -706,14 +702,13 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
             else:
                 row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
                 row.variance[i] = (own_rate / 3)
-    if (not (agrees or outvoted)):
-        a[41] -= since
-        return False
-    if agrees:
+        if (a[41] > since):
+            a[41] -= since
+            return False
+        a[41] = 0.0
+    else:
         _t3 = (a[41] + since)
         a[41] = (2.0 if 2.0 < _t3 else _t3)
-    else:
-        a[41] = 0.0
     share = (since / (1.0 + since))
     _t4 = (16.0 * own_force)
     a[39] += (share * ((_t4 if _t4 < force else force) - a[39]))

@@ -21,13 +21,14 @@ from tests.helpers.streams import MS, SECOND, T0, Drive, config, drive, fuse, me
 
 Change = Callable[[Array, float, int], Array]  # a reading (6,) of force and rate, seconds since the begin, number
 AT_S = 12.0  # in motion, aligned
+UNIT = np.eye(6)  # of each axis
 BAD = {
     "gyro x 5 rad/s": lambda z: np.array([*z[:3], 5.0, *z[4:]]),
     "gyro z 5 rad/s": lambda z: np.array([*z[:5], 5.0]),
-    "gyro z -3 rad/s more": lambda z: z - [0, 0, 0, 0, 0, 3.0],
+    "gyro z -3 rad/s more": lambda z: z - 3.0 * UNIT[5],
     "all gyros 34.9": lambda z: np.array([*z[:3], 34.9, 34.9, 34.9]),
     "all accelerometers 159": lambda z: np.array([159.0, 159.0, 159.0, *z[3:]]),
-    "accelerometer x 80 more": lambda z: z + [80.0, 0, 0, 0, 0, 0],
+    "accelerometer x 80 more": lambda z: z + 80.0 * UNIT[0],
 }
 
 
@@ -51,7 +52,11 @@ def from_number(first: int, count: int, bad: Callable[[Array], Array]) -> Change
 
 
 def weaving(duration: float, rate: float = 100.0) -> Drive:
-    return drive(duration, lambda t: 12.0 * ramp(t, 3.0, 6.0), lambda t: 0.3 + 0.6 * np.sin(0.4 * t) * ramp(t, 4.0, 4.0), rate=rate)
+    """Pulls away after 3 s, then weaves."""
+    def yaw(t: Array) -> Array:
+        return np.asarray(0.3 + 0.6 * np.sin(0.4 * t) * ramp(t, 4.0, 4.0))
+
+    return drive(duration, lambda t: 12.0 * ramp(t, 3.0, 6.0), yaw, rate)
 
 
 def place(fusion: Fusion, t_ns: int) -> Array:
@@ -93,7 +98,7 @@ def test_a_second_of_them_is_bridged(length_s: float) -> None:
 
 def test_a_rejected_sample_says_by_how_much(compiled: bool) -> None:
     events = [event for event in measurements(weaving(6.0, 50.0), seed=1) if event.t_ns <= T0 + 6 * SECOND]
-    fusion = fuse(config(), spoiled(events, from_number(200, 1, lambda z: z + [0, 0, 0, 0, 7.0, 0])), compiled)
+    fusion = fuse(config(), spoiled(events, from_number(200, 1, lambda z: z + 7.0 * UNIT[4])), compiled)
     rows = fusion.history.rows
     (row,) = rows[(rows["source"] == fusion.params.imu_source) & (rows["outcome"] == Outcome.REJECTED)]
     assert row["t_ns"] == T0 + 4 * SECOND
@@ -132,7 +137,7 @@ def test_nothing_is_interpolated_towards_a_bad_sample(compiled: bool) -> None:
 @needs_compiled
 def test_a_change_that_lasts_is_believed_after_two_seconds() -> None:
     truth = weaving(AT_S + 4.0)
-    events = spoiled(measurements(truth, seed=4), lambda z, t, _: z + [0, 0, 0, 0, 0, 6.0 * (t >= AT_S)])
+    events = spoiled(measurements(truth, seed=4), lambda z, t, _: z + 6.0 * (t >= AT_S) * UNIT[5])
     fusion = Fusion(config())
     believed = 0
     for event in events:
@@ -149,7 +154,7 @@ def test_a_bad_sample_after_a_silence_is_given_up_at_the_next(compiled: bool) ->
         for event in measurements(weaving(6.0, 50.0), seed=1)
         if not (isinstance(event.payload, ImuSample) and T0 + 5 * SECOND <= event.t_ns < T0 + 5.4 * SECOND)
     ]
-    events = spoiled(events, lambda z, t, _: z + [0, 0, 0, 0, 0, 9.0 * (abs(t - 5.4) < 1e-6)])
+    events = spoiled(events, lambda z, t, _: z + 9.0 * (abs(t - 5.4) < 1e-6) * UNIT[5])
     fusion = fuse(config(), events, compiled)
     assert fusion.history.head.stamps[PHASE] == RUNNING
     assert fusion.outcomes()["imu0"]["REJECTED"] == 0
@@ -164,8 +169,8 @@ def test_a_good_sensor_is_never_rejected(rate: float) -> None:
 
     def shaken(z: Array, t: float, _: int) -> Array:
         strength = 5.0 if t > 9.0 else 0.2
-        blow = 30.0 if abs(t - 12.0) < 1e-6 else 0.0
-        return z + strength * rng.standard_normal(6) * [1, 1, 1, 0.04, 0.04, 0.04] + [0, 0, blow, 0, 0.3 * (blow > 0), 0]
+        blow = 30.0 * UNIT[2] + 0.3 * UNIT[4]
+        return z + strength * rng.standard_normal(6) * [1, 1, 1, 0.04, 0.04, 0.04] + (abs(t - 12.0) < 1e-6) * blow
 
     fusion = fuse(config(imu={"accel_noise": 0.5}), spoiled(measurements(weaving(16.0, rate), seed=2), shaken))
     assert fusion.outcomes()["imu0"]["REJECTED"] == 0
