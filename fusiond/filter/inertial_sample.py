@@ -79,11 +79,13 @@ def compare(state: FilterState, values: Vector, elapsed: float, params: Paramete
 
 
 @compiled
-def ratios(force: float, rate: float, own_force: float, own_rate: float, since: float) -> tuple[float, float]:
+def ratios(
+    force: float, rate: float, own_force: float, own_rate: float, since: float, blows: float
+) -> tuple[float, float]:
     """Test ratios of the changes of force and rate, `since` [s] after the sample before: above 1 neither scatter nor physics
-    explain them."""
-    by_force = force / (OWN * own_force + square(BLOW_FORCE + JERK * since))
-    return by_force, rate / (OWN * own_rate + square(BLOW_RATE + SWING * since))
+    explain them, with so many `blows`."""
+    by_force = force / (OWN * own_force + square(blows * BLOW_FORCE + JERK * since))
+    return by_force, rate / (OWN * own_rate + square(blows * BLOW_RATE + SWING * since))
 
 
 @compiled
@@ -106,7 +108,7 @@ def is_believed(state: FilterState, values: Vector, t_ns: int, params: Parameter
         return True
     elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    by_force, by_rate = ratios(force, rate, own_force, own_rate, since)
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, since, 1.0)
     return not (by_force > 1 or by_rate > 1)
 
 
@@ -121,7 +123,7 @@ def judge(state: FilterState, row: Row, params: Parameters) -> bool:
         return True
     elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    by_force, by_rate = ratios(force, rate, own_force, own_rate, since)
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, since, 1.0)
     if by_force > 1 or by_rate > 1:
         row["ratio"] = max(by_force, by_rate)
         for i in range(3):
@@ -152,13 +154,14 @@ def doubt(
     other.
 
     Over a gap of length s the signal goes its own way: a random walk, whose steps are the mean change between samples. And a
-    change that is not the sensor's scatter may have come at any instant of the gap.
+    change may have come at any instant of the gap. That holds as well of a change that only a blow explains.
     """
     held = state.stamps[T_IMU]
     elapsed = (until_ns - held) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    whole = believed and not state.source_stamps[params.imu_source, T_LAST] > held
-    if whole and not (force > OWN * own_force or rate > OWN * own_rate):
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, elapsed, 0.0)
+    bridged = not believed or state.source_stamps[params.imu_source, T_LAST] > held
+    if not (bridged or by_force > 1 or by_rate > 1):
         return 0.0, 0.0
     if not believed:
         elapsed, force, rate = (t_ns - held) * 1e-9, 0.0, 0.0

@@ -619,10 +619,10 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
-cdef (double, double) inertial_sample_ratios(double force, double rate, double own_force, double own_rate, double since) noexcept nogil:
+cdef (double, double) inertial_sample_ratios(double force, double rate, double own_force, double own_rate, double since, double blows) noexcept nogil:
     cdef double by_force
-    by_force = (force / ((36.0 * own_force) + portable_square((40.0 + (400.0 * since)))))
-    return (by_force, (rate / ((36.0 * own_rate) + portable_square((1.0 + (20.0 * since))))))
+    by_force = (force / ((36.0 * own_force) + portable_square(((blows * 40.0) + (400.0 * since)))))
+    return (by_force, (rate / ((36.0 * own_rate) + portable_square(((blows * 1.0) + (20.0 * since))))))
 
 cdef double inertial_sample_since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef int64_t last
@@ -653,7 +653,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since)
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since, 1.0)
     by_force = _t2[0]
     by_rate = _t2[1]
     return (not ((by_force > 1) or (by_rate > 1)))
@@ -690,7 +690,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since)
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since, 1.0)
     by_force = _t2[0]
     by_rate = _t2[1]
     if ((by_force > 1) or (by_rate > 1)):
@@ -724,9 +724,12 @@ cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_
     cdef double rate
     cdef double own_force
     cdef double own_rate
-    cdef bint whole
-    cdef double _t2
+    cdef (double, double) _t2
+    cdef double by_force
+    cdef double by_rate
+    cdef bint bridged
     cdef double _t3
+    cdef double _t4
     cdef double steps
     held = state.stamps[1]
     elapsed = ((until_ns - held) * 1e-09)
@@ -735,14 +738,17 @@ cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    whole = (believed and (not (state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0] > held)))
-    if (whole and (not ((force > (36.0 * own_force)) or (rate > (36.0 * own_rate))))):
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, elapsed, 0.0)
+    by_force = _t2[0]
+    by_rate = _t2[1]
+    bridged = ((not believed) or (state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0] > held))
+    if (not (bridged or (by_force > 1) or (by_rate > 1))):
         return (0.0, 0.0)
     if (not believed):
         elapsed, force, rate = ((t_ns - held) * 1e-09), 0.0, 0.0
-    _t2 = state.memory[(params.imu_source) * MEMORY_SIZE + 13]
-    _t3 = (elapsed / (0.0001 if 0.0001 > _t2 else _t2))
-    steps = (1.0 if 1.0 > _t3 else _t3)
+    _t3 = state.memory[(params.imu_source) * MEMORY_SIZE + 13]
+    _t4 = (elapsed / (0.0001 if 0.0001 > _t3 else _t3))
+    steps = (1.0 if 1.0 > _t4 else _t4)
     return ((((own_force * steps) + (0.08333333333333333 * force)) * elapsed), (((own_rate * steps) + (0.08333333333333333 * rate)) * elapsed))
 
 cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
