@@ -1,25 +1,28 @@
 """One inertial sample judged by those before it, and the health of each of the sensor's axes.
 
 A sample is compared with the held one, the newest that was believed. The change is explained by the sensor's own scatter,
-the mean square of such changes, or by what may happen to a vehicle from one sample to the next. A sample that neither
-explains is rejected: the state goes on with the held one, and from there to the next sample that is believed. The gap is
-bridged with the noise of what the vehicle may have done in it unseen.
+the mean square of such changes, or by what can happen to a vehicle from one sample to the next. A sample that neither
+explains is rejected: the state goes on with the held one, and from there to the next sample that is believed, with the
+noise of what the vehicle may have done unseen. Where that takes longer than `imu_gap`, it coasts.
 
 Who is wrong is put to the vote: the held sample has the support of the time over which samples agreed with it, at most
 `SUPPORT_TIME`, and a sample that contradicts it takes from that support the time since the sample before. Where nothing
-of it is left, the held one is given up. So one bad sample, or a few, change nothing; a change that lasts is believed.
+of it is left, the held one is given up. So a bad sample changes nothing, nor do many; one that is believed by mistake, the
+first after a silence, is soon given up.
 
-A judgement depends on the samples before alone, so an event between the held sample and one that is not believed knows as
+A judgement depends on the samples before alone. So an event between the held sample and one that is not believed knows as
 well that it must not interpolate towards it.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusiond.filter.parameters import SENSOR_AXES, Parameters
 from fusiond.filter.rows import Row
-from fusiond.filter.source_health import blame_frozen, judge_repetition
+from fusiond.filter.source_health import blame_frozen, is_trusted, judge_repetition
 from fusiond.filter.state import (
     CHANGE_FORCE,
     CHANGE_RATE,
@@ -43,12 +46,12 @@ from fusiond.maths.typed import Vector, compiled
 
 BLOW_RATE = 1.0  # rad/s: what a kerb or a pothole changes a vehicle's angular rate by at once
 BLOW_FORCE = 40.0  # m/s^2: and its specific force
-SWING = 20.0  # rad/s^2: what engine, brakes, tyres or propellers add to that, for as long as no sample is believed
+SWING = 20.0  # rad/s^2: and what tyres, brakes or propellers add to that in the time between two samples
 JERK = 400.0  # m/s^3: the same of the specific force
 OWN = 36.0  # a squared change of up to so many times the mean one is the sensor's own scatter
 CLIPPED = 16.0  # a squared change counts in the mean for at most so many times that
 SCATTER_TIME = 1.0  # s, over which the mean is taken
-SUPPORT_TIME = 0.15  # s: the most that a lasting change must last
+SUPPORT_TIME = 2.0  # s
 MIN_SPAN = 1e-4  # s: two inertial samples are not taken as closer
 UNIFORM = 1 / 12  # of the square of a range: variance of what may lie anywhere in it
 
@@ -76,75 +79,89 @@ def compare(state: FilterState, values: Vector, elapsed: float, params: Paramete
 
 
 @compiled
-def ratio_of(change: float, own: float, blow: float) -> float:
-    """A squared change over the largest one that scatter and physics explain."""
-    return change / (OWN * own + square(blow))
+def ratios(
+    force: float, rate: float, own_force: float, own_rate: float, since: float, blows: float
+) -> tuple[float, float]:
+    """Test ratios of the changes of force and rate, `since` [s] after the sample before: above 1 neither scatter nor physics
+    explain them, with so many `blows`."""
+    by_force = force / (OWN * own_force + square(blows * BLOW_FORCE + JERK * since))
+    return by_force, rate / (OWN * own_rate + square(blows * BLOW_RATE + SWING * since))
+
+
+@compiled
+def since_last(state: FilterState, t_ns: int, params: Parameters) -> float:
+    """Time [s] since the sample before, believed or not; infinite where there is nothing to judge by: no sample, or none
+    within `imu_gap`."""
+    last = state.source_stamps[params.imu_source, T_LAST]
+    if state.stamps[T_IMU] == NEVER or last == NEVER or t_ns - last > params.imu_gap_ns:
+        return math.inf
+    return (t_ns - last) * 1e-9
 
 
 @compiled
 def is_believed(state: FilterState, values: Vector, t_ns: int, params: Parameters) -> bool:
-    """Whether a sample may be used, which is the next one after the newest behind the state."""
-    held = state.stamps[T_IMU]
-    if held == NEVER or t_ns - held > params.imu_gap_ns or not state.auxiliary[SUPPORT] > _since_last(state, t_ns, params):
-        return True
-    elapsed = (t_ns - held) * 1e-9
-    force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    if ratio_of(force, own_force, BLOW_FORCE + JERK * elapsed) > 1:
+    """Whether a sample, the next one after the newest behind the state, may be used."""
+    if not is_trusted(state.memory[params.imu_source]):
         return False
-    return not ratio_of(rate, own_rate, BLOW_RATE + SWING * elapsed) > 1
-
-
-@compiled
-def _since_last(state: FilterState, t_ns: int, params: Parameters) -> float:
-    """Time [s] since the sample before, believed or not."""
-    return (t_ns - state.source_stamps[params.imu_source, T_LAST]) * 1e-9
+    since = since_last(state, t_ns, params)
+    if not state.auxiliary[SUPPORT] > since:
+        return True
+    elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
+    force, rate, own_force, own_rate = compare(state, values, elapsed, params)
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, since, 1.0)
+    return not (by_force > 1 or by_rate > 1)
 
 
 @compiled
 def judge(state: FilterState, row: Row, params: Parameters) -> bool:
-    """Judge a sample: `is_believed`, and what that changes. One that contradicts the held sample gets ratio, innovation and
-    variance of the accelerometer or the gyro, whichever is further off."""
-    a, values, t_ns, held = state.auxiliary, row["values"], int(row["t_ns"]), state.stamps[T_IMU]
-    if held == NEVER or t_ns - held > params.imu_gap_ns:
+    """Judge a sample of a sensor that is trusted: `is_believed`, and what that changes. One that contradicts the held sample
+    gets ratio, innovation and variance of the accelerometer or the gyro, whichever is further off."""
+    a, values, t_ns = state.auxiliary, row["values"], int(row["t_ns"])
+    since = since_last(state, t_ns, params)
+    if since == math.inf:
         a[SUPPORT] = 0.0
         return True
-    elapsed, since = (t_ns - held) * 1e-9, _since_last(state, t_ns, params)
+    elapsed = (t_ns - state.stamps[T_IMU]) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    by_force = ratio_of(force, own_force, BLOW_FORCE + JERK * elapsed)
-    by_rate = ratio_of(rate, own_rate, BLOW_RATE + SWING * elapsed)
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, since, 1.0)
+    if by_force > 1 or by_rate > 1:
+        row["ratio"] = max(by_force, by_rate)
+        for i in range(3):
+            if by_force > by_rate:
+                row["innovation"][i] = values[i] - a[HELD_FORCE_B.start + i]
+                row["variance"][i] = own_force / 3
+            else:
+                row["innovation"][i] = values[3 + i] - a[HELD_RATE_B.start + i]
+                row["variance"][i] = own_rate / 3
+        if a[SUPPORT] > since:
+            a[SUPPORT] -= since
+            return False
+        a[SUPPORT] = 0.0
+    else:
+        a[SUPPORT] = min(a[SUPPORT] + since, SUPPORT_TIME)
     share = since / (SCATTER_TIME + since)
     a[CHANGE_FORCE] += share * (min(force, CLIPPED * own_force) - a[CHANGE_FORCE])
     a[CHANGE_RATE] += share * (min(rate, CLIPPED * own_rate) - a[CHANGE_RATE])
-    if not (by_force > 1 or by_rate > 1):
-        a[SUPPORT] = min(a[SUPPORT] + since, SUPPORT_TIME)
-        return True
-    row["ratio"] = max(by_force, by_rate)
-    for i in range(3):
-        if by_force > by_rate:
-            row["innovation"][i] = values[i] - a[HELD_FORCE_B.start + i]
-            row["variance"][i] = own_force / 3
-        else:
-            row["innovation"][i] = values[3 + i] - a[HELD_RATE_B.start + i]
-            row["variance"][i] = own_rate / 3
-    believed = not a[SUPPORT] > since
-    a[SUPPORT] = 0.0 if believed else a[SUPPORT] - since
-    return believed
+    return True
 
 
 @compiled
-def doubt(state: FilterState, values: Vector, t_ns: int, until_ns: int, believed: bool, params: Parameters) -> tuple[float, float]:
+def doubt(
+    state: FilterState, values: Vector, t_ns: int, until_ns: int, believed: bool, params: Parameters
+) -> tuple[float, float]:
     """What interpolation may miss: noise densities of acceleration [(m/s^2)^2/Hz] and rate [(rad/s)^2/Hz] for a piece of the
     interval from the held sample, up to `t_ns`; the next sample is of `until_ns`. None between good samples, one after the
     other.
 
     Over a gap of length s the signal goes its own way: a random walk, whose steps are the mean change between samples. And a
-    change that is not the sensor's scatter may have come at any instant of the gap.
+    change may have come at any instant of the gap. That holds as well of a change that only a blow explains.
     """
     held = state.stamps[T_IMU]
     elapsed = (until_ns - held) * 1e-9
     force, rate, own_force, own_rate = compare(state, values, elapsed, params)
-    whole = believed and not state.source_stamps[params.imu_source, T_LAST] > held
-    if whole and not (force > OWN * own_force or rate > OWN * own_rate):
+    by_force, by_rate = ratios(force, rate, own_force, own_rate, elapsed, 0.0)
+    bridged = not believed or state.source_stamps[params.imu_source, T_LAST] > held
+    if not (bridged or by_force > 1 or by_rate > 1):
         return 0.0, 0.0
     if not believed:
         elapsed, force, rate = (t_ns - held) * 1e-9, 0.0, 0.0

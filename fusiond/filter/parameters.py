@@ -132,8 +132,9 @@ def _parameters(source: str, sources: tuple[str, ...], config: Config, streams: 
     table, name, section, stream, _ = streams[source]
     model = model_of(stream)
     if model == IMU:
+        (imu,) = config.imu.values()
         row = empty_row()
-        row[SENSOR_AXES] = matrix_from_euler(*(math.radians(angle) for angle in section.rotation_deg)).ravel()
+        row[SENSOR_AXES] = matrix_from_euler(*(math.radians(angle) for angle in imu.rotation_deg)).ravel()
         return row
     row = MODELS[model].parameters(section)
     row[CORRELATION] = stream.correlation_s

@@ -95,7 +95,9 @@ def can_step(state: FilterState, row: Row, params: Parameters) -> bool:
         return False
     if phase == ALIGNING:
         return model not in (GNSS_POSITION, GNSS_VELOCITY)
-    if phase == RUNNING and model == IMU and coasts(state, t_ns, params) and source_health.is_trusted(state.memory[params.imu_source]):
+    if phase == RUNNING and model == IMU and coasts(state, t_ns, params):
+        if not inertial_sample.is_believed(state, row["values"], t_ns, params):
+            return True
         grown = square(COAST_TURN) * ((t_ns - stamps[T]) * 1e-9)
         return not yaw_variance(state) + grown > square(LOST_HEADING) / 2
     return True

@@ -32,7 +32,8 @@ class _Row(NamedTuple):
 
 
 class Innovations:
-    """Measurements received, until the outcome of each is known. IMU samples have none: they propagate the state."""
+    """Measurements received, until the outcome of each is known. IMU samples propagate the state: of them only those that
+    are rejected have an innovation."""
 
     def __init__(self, vehicle: str, fusion: Fusion) -> None:
         params = fusion.params
@@ -45,7 +46,7 @@ class Innovations:
 
     def add(self, receipt: Receipt) -> None:
         """Add a receipt of any source."""
-        if receipt.measurement.source != self._imu:
+        if receipt.measurement.source != self._imu or receipt.refusal is None:
             self._pending.append(receipt)
             if receipt.refusal is None:
                 self._unread_ns = min(self._unread_ns, receipt.measurement.t_ns)
@@ -62,7 +63,7 @@ class Innovations:
             row = rows.get(self._key(receipt.measurement)) if receipt.refusal is None else None
             if row is not None and row.outcome is Outcome.WAITING and left <= MAX_PENDING:
                 self._pending.append(receipt)
-            else:
+            elif receipt.measurement.source != self._imu or (row is not None and row.outcome is Outcome.REJECTED):
                 found.append(self._message(receipt, row))
         self._unread_ns = min((one.measurement.t_ns for one in self._pending), default=NEVER_NS)
         return found

@@ -1,15 +1,16 @@
 """The order of arrival never changes a bit: any shuffle inside the horizon gives the same state, outcomes and counts.
 
 A case is a few seconds of a drive with everything that makes arrival matter: duplicates, outliers at the gate's edge,
-invalid samples, IMU samples that are missing for longer than it may be silent, events stamped after the newest IMU
-sample. It is fused in the order of the stamps, and again in a random order of arrival in which no event is later than the
-horizon. Hypothesis draws a seed and the shape of the case, and prints them when a case fails.
+invalid samples, IMU samples that are nonsense, or missing for longer than it may be silent, events stamped after the
+newest IMU sample. It is fused in the order of the stamps, and again in a random order of arrival in which no event is later
+than the horizon. Hypothesis draws a seed and the shape of the case, and prints them when a case fails.
 """
 
 from __future__ import annotations
 
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -32,6 +33,7 @@ CASES = st.fixed_dictionaries(
         "horizon_s": st.sampled_from([0.3, 0.6, 1.0]),
         "snapshot_interval_s": st.sampled_from([0.0, 0.01, 0.05, 0.3]),
         "imu_hole": st.booleans(),
+        "imu_lies": st.booleans(),  # some of its samples are far off, and some in a row
         "correlation_s": st.sampled_from([0.0, 0.5]),
         "heading": st.booleans(),  # given, or found by the bank of hypotheses
         "learns": st.booleans(),  # delays, lever arm, scale of each wheel; fixes weighted as a mixture
@@ -85,7 +87,9 @@ def spoiled(events: list[Measurement], case: Case) -> list[Measurement]:
             continue
         chance = random.random()
         payload: Payload | Invalid = event.payload
-        if chance < 0.1:
+        if imu and case.get("imu_lies") and (chance < 0.05 or event.sequence % 40 < 3):
+            payload = nonsense(random)
+        elif chance < 0.1:
             payload = off(payload, random)
         elif chance < 0.12:
             payload = Invalid("fault")
@@ -107,6 +111,12 @@ def off(payload: Payload | Invalid, random: np.random.Generator) -> Payload | In
     if isinstance(payload, WheelSpeed):
         return WheelSpeed(payload.speed + random.normal(0, 0.4))
     return payload
+
+
+def nonsense(random: np.random.Generator) -> ImuSample:
+    """An inertial sample that no vehicle explains."""
+    x, y, z, *rate = (float(number) for number in random.uniform(-1.0, 1.0, 6))
+    return ImuSample((150 * x, 150 * y, 150 * z), (30 * rate[0], 30 * rate[1], 30 * rate[2]))
 
 
 def arrival(events: list[Measurement], case: Case) -> list[Measurement]:
@@ -160,6 +170,10 @@ def test_shuffled_while_aligning(seed: int) -> None:
     """The start itself does not depend on the order of arrival: the first 2.5 s are shuffled."""
     case: Case = {"seed": seed, "begin_s": 9.0, "horizon_s": 0.6, "snapshot_interval_s": 0.05, "imu_hole": False}
     events = [event for event in drive_events() if 0 <= event.t_ns - T0 - 9 * SECOND < 2.5 * SECOND]
+    random = np.random.default_rng(seed)
+    for i in random.integers(100, len(events), 5):
+        if isinstance(events[i].payload, ImuSample):
+            events[i] = msgspec.structs.replace(events[i], payload=nonsense(random))
     settings_ = configuration(case | {"correlation_s": 0.0})
     in_order, shuffled = fuse(settings_, events), fuse(settings_, arrival(events, case))
     assert in_order.history.head.stamps[PHASE] == RUNNING
@@ -167,9 +181,20 @@ def test_shuffled_while_aligning(seed: int) -> None:
 
 
 @needs_compiled
+def test_bad_samples_are_rejected_in_any_order() -> None:
+    """What the shuffled cases are about: some are rejected, a late one that is good makes others believed."""
+    case: Case = {"seed": 2, "begin_s": 20.0, "horizon_s": 0.6, "snapshot_interval_s": 0.05, "imu_hole": False}
+    case |= {"correlation_s": 0.0, "imu_lies": True, "read_every": 1}
+    prefix, events = stretch(case)
+    fusion = fuse(configuration(case), prefix + arrival(events, case), True)
+    assert 10 < fusion.outcomes()["imu0"]["REJECTED"] < 60
+    check(case, compiled=True)
+
+
+@needs_compiled
 @pytest.mark.parametrize("interval_s", [0.01, 0.05, 0.5])
 def test_snapshots_at_any_spacing(interval_s: float) -> None:
-    case: Case = {"seed": 5, "begin_s": 20.0, "horizon_s": 1.0, "imu_hole": True, "correlation_s": 0.5}
+    case: Case = {"seed": 5, "begin_s": 20.0, "horizon_s": 1.0, "imu_hole": True, "imu_lies": True, "correlation_s": 0.5}
     every: Fusion | None = None
     for spacing in (0.0, interval_s):
         prefix, events = stretch(case)

@@ -732,88 +732,102 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
-cdef double inertial_sample_ratio_of(double change, double own, double blow) noexcept nogil:
-    return (change / ((36.0 * own) + portable_square(blow)))
+cdef (double, double) inertial_sample_ratios(double force, double rate, double own_force, double own_rate, double since, double blows) noexcept nogil:
+    cdef double by_force
+    by_force = (force / ((36.0 * own_force) + portable_square(((blows * 40.0) + (400.0 * since)))))
+    return (by_force, (rate / ((36.0 * own_rate) + portable_square(((blows * 1.0) + (20.0 * since))))))
+
+cdef double inertial_sample_since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
+    cdef int64_t last
+    last = state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0]
+    if ((state.stamps[1] == (<int64_t>-4611686018427387904)) or (last == (<int64_t>-4611686018427387904)) or ((t_ns - last) > params.imu_gap_ns)):
+        return INFINITY
+    return ((t_ns - last) * 1e-09)
 
 cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
-    cdef int64_t held
+    cdef double since
     cdef double elapsed
     cdef (double, double, double, double) _t1
     cdef double force
     cdef double rate
     cdef double own_force
     cdef double own_rate
-    held = state.stamps[1]
-    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns) or (not (state.auxiliary[45] > inertial_sample__since_last(state, t_ns, params)))):
+    cdef (double, double) _t2
+    cdef double by_force
+    cdef double by_rate
+    if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
+        return False
+    since = inertial_sample_since_last(state, t_ns, params)
+    if (not (state.auxiliary[45] > since)):
         return True
-    elapsed = ((t_ns - held) * 1e-09)
+    elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
     force = _t1[0]
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    if (inertial_sample_ratio_of(force, own_force, (40.0 + (400.0 * elapsed))) > 1):
-        return False
-    return (not (inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed))) > 1))
-
-cdef double inertial_sample__since_last(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
-    return ((t_ns - state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0]) * 1e-09)
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since, 1.0)
+    by_force = _t2[0]
+    by_rate = _t2[1]
+    return (not ((by_force > 1) or (by_rate > 1)))
 
 cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef double* a
     cdef double* values
     cdef int64_t t_ns
-    cdef int64_t held
-    cdef double elapsed
     cdef double since
+    cdef double elapsed
     cdef (double, double, double, double) _t1
     cdef double force
     cdef double rate
     cdef double own_force
     cdef double own_rate
+    cdef (double, double) _t2
     cdef double by_force
     cdef double by_rate
-    cdef double share
-    cdef double _t2
-    cdef double _t3
-    cdef double _t4
     cdef int64_t i
-    cdef bint believed
+    cdef double _t3
+    cdef double share
+    cdef double _t4
+    cdef double _t5
     a = state.auxiliary
     values = row.values
     t_ns = (<int64_t>row.t_ns)
-    held = state.stamps[1]
-    if ((held == (<int64_t>-4611686018427387904)) or ((t_ns - held) > params.imu_gap_ns)):
+    since = inertial_sample_since_last(state, t_ns, params)
+    if (since == INFINITY):
         a[45] = 0.0
         return True
-    elapsed, since = ((t_ns - held) * 1e-09), inertial_sample__since_last(state, t_ns, params)
+    elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
     force = _t1[0]
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    by_force = inertial_sample_ratio_of(force, own_force, (40.0 + (400.0 * elapsed)))
-    by_rate = inertial_sample_ratio_of(rate, own_rate, (1.0 + (20.0 * elapsed)))
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, since, 1.0)
+    by_force = _t2[0]
+    by_rate = _t2[1]
+    if ((by_force > 1) or (by_rate > 1)):
+        row.ratio = (by_rate if by_rate > by_force else by_force)
+        for i in range(3):
+            if (by_force > by_rate):
+                row.innovation[i] = (values[i] - a[(0 + i)])
+                row.variance[i] = (own_force / 3)
+            else:
+                row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
+                row.variance[i] = (own_rate / 3)
+        if (a[45] > since):
+            a[45] -= since
+            return False
+        a[45] = 0.0
+    else:
+        _t3 = (a[45] + since)
+        a[45] = (2.0 if 2.0 < _t3 else _t3)
     share = (since / (1.0 + since))
-    _t2 = (16.0 * own_force)
-    a[43] += (share * ((_t2 if _t2 < force else force) - a[43]))
-    _t3 = (16.0 * own_rate)
-    a[44] += (share * ((_t3 if _t3 < rate else rate) - a[44]))
-    if (not ((by_force > 1) or (by_rate > 1))):
-        _t4 = (a[45] + since)
-        a[45] = (0.15 if 0.15 < _t4 else _t4)
-        return True
-    row.ratio = (by_rate if by_rate > by_force else by_force)
-    for i in range(3):
-        if (by_force > by_rate):
-            row.innovation[i] = (values[i] - a[(0 + i)])
-            row.variance[i] = (own_force / 3)
-        else:
-            row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
-            row.variance[i] = (own_rate / 3)
-    believed = (not (a[45] > since))
-    a[45] = (0.0 if believed else (a[45] - since))
-    return believed
+    _t4 = (16.0 * own_force)
+    a[43] += (share * ((_t4 if _t4 < force else force) - a[43]))
+    _t5 = (16.0 * own_rate)
+    a[44] += (share * ((_t5 if _t5 < rate else rate) - a[44]))
+    return True
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
     cdef int64_t held
@@ -823,9 +837,12 @@ cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_
     cdef double rate
     cdef double own_force
     cdef double own_rate
-    cdef bint whole
-    cdef double _t2
+    cdef (double, double) _t2
+    cdef double by_force
+    cdef double by_rate
+    cdef bint bridged
     cdef double _t3
+    cdef double _t4
     cdef double steps
     held = state.stamps[1]
     elapsed = ((until_ns - held) * 1e-09)
@@ -834,14 +851,17 @@ cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_
     rate = _t1[1]
     own_force = _t1[2]
     own_rate = _t1[3]
-    whole = (believed and (not (state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0] > held)))
-    if (whole and (not ((force > (36.0 * own_force)) or (rate > (36.0 * own_rate))))):
+    _t2 = inertial_sample_ratios(force, rate, own_force, own_rate, elapsed, 0.0)
+    by_force = _t2[0]
+    by_rate = _t2[1]
+    bridged = ((not believed) or (state.source_stamps[(params.imu_source) * SOURCE_STAMPS_SIZE + 0] > held))
+    if (not (bridged or (by_force > 1) or (by_rate > 1))):
         return (0.0, 0.0)
     if (not believed):
         elapsed, force, rate = ((t_ns - held) * 1e-09), 0.0, 0.0
-    _t2 = state.memory[(params.imu_source) * MEMORY_SIZE + 13]
-    _t3 = (elapsed / (0.0001 if 0.0001 > _t2 else _t2))
-    steps = (1.0 if 1.0 > _t3 else _t3)
+    _t3 = state.memory[(params.imu_source) * MEMORY_SIZE + 13]
+    _t4 = (elapsed / (0.0001 if 0.0001 > _t3 else _t3))
+    steps = (1.0 if 1.0 > _t4 else _t4)
     return ((((own_force * steps) + (0.08333333333333333 * force)) * elapsed), (((own_rate * steps) + (0.08333333333333333 * rate)) * elapsed))
 
 cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
@@ -2936,7 +2956,9 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
         return False
     if (phase == 1):
         return (model != 0 and model != 1)
-    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params) and source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
+    if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params)):
+        if (not inertial_sample_is_believed(state, row.values, t_ns, params)):
+            return True
         grown = (portable_square(0.3) * ((t_ns - stamps[0]) * 1e-09))
         return (not ((step_yaw_variance(state) + grown) > (portable_square(0.20943951023931956) / 2)))
     return True

@@ -61,6 +61,20 @@ def test_every_measurement_has_one_and_outcomes_add_up(events: list[Received]) -
             assert len(mine) == sum(counts.values()) - counts["WAITING"] > 10
 
 
+def test_of_the_imu_only_a_rejected_sample_has_one(events: list[Received]) -> None:
+    imu = [i for i, event in enumerate(events) if event.source == "imu0"]
+    spoiled = list(events)
+    bad = events[imu[len(imu) // 2]]
+    assert isinstance(bad.payload, ImuSample)
+    spoiled[imu[len(imu) // 2]] = replace(bad, payload=replace(bad.payload, angular_rate_b=(0.0, 20.0, 0.0)))
+    (message,) = (message for message in run(settings(), spoiled)[1] if message.source == "imu0")
+    assert message.outcome == "rejected"
+    assert message.t_receive_ns == bad.t_receive_ns
+    assert message.test_ratio is not None
+    assert message.test_ratio > 10
+    assert message.innovation[1] == pytest.approx(20.0, abs=0.3)
+
+
 @pytest.mark.parametrize("rate_hz", [0.2, 1.0])
 def test_rare_ticks_lose_no_outcome(events: list[Received], rate_hz: float) -> None:
     """The history drops rows after a second; here a second or five lie between two ticks."""
