@@ -93,6 +93,7 @@ LAST_SUM = _memory.one()  # of the last reading's numbers: shows a repeated one
 INTERVAL = _memory.one()  # s, mean spacing of the events
 LAST_INNOVATION = _memory.block(3)  # of the last rejection
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
+FIX_TYPE = _memory.one()  # of a receiver's last fix; 0 before the first
 MEMORY_SIZE = _memory.size
 
 # Stamps and counts: places in FilterState.stamps

@@ -3,7 +3,7 @@
 cdef enum:
     NOMINAL_SIZE = 31
     AUXILIARY_SIZE = 40
-    MEMORY_SIZE = 18
+    MEMORY_SIZE = 19
     STAMPS_SIZE = 22
     SOURCE_STAMPS_SIZE = 6
     HYPOTHESES = 13
@@ -30,6 +30,7 @@ cdef struct Observation:
     double innovation[3]
     double jacobian[2 * n + WIDE_SIZE]
     double variance[3]
+    double common[3]
 
 cdef struct Row:
     int64_t t_ns
