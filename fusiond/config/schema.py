@@ -170,7 +170,8 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     fixed_sigma_m: Positive = 0.02  # while it is RTK fixed
     fixed_height_sigma_m: Positive = 0.03
     velocity_sigma_mps: Positive = 0.2  # the same for the velocity, per axis
-    position_correlation_s: NotNegative = 30.0  # correlation time of the position's slow errors, four fifths of its variance
+    position_correlation_s: NotNegative = 30.0  # correlation time of the position's slow error; 0: all its errors are white
+    position_white_share: Annotated[float, Meta(ge=0.01, le=1)] = 0.2  # of its variance; the rest is the slow error's
     velocity_correlation_s: NotNegative = 2.0  # correlation time of velocity errors: dense ones weigh less
     use_velocity: bool = True  # fuse speed and course as well
     outliers: Literal["gate", "mixture"] = "gate"  # reject them, or weight each fix by its likelihood of being one

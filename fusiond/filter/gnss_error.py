@@ -16,11 +16,11 @@ import numpy as np
 
 from fusiond.filter.observations.gnss_position import (
     ERROR_TIME,
+    SLOW_SHARE,
     STAMP_SIGMA,
     TYPE_OF_FIX,
     VARIANCE_HORIZONTAL,
     VARIANCE_VERTICAL,
-    slow_share,
 )
 from fusiond.filter.observations.model import NOISE_MAX, NOISE_MIN, Observation
 from fusiond.filter.parameters import Parameters
@@ -60,7 +60,7 @@ def carry(state: FilterState, source: int, values: Vector, params: Parameters) -
     for i in range(3):
         p[:, GNSS_ERROR.start + i] *= kept
     factor = noise_factor(state.memory[source], parameter[NOISE_MIN], parameter[NOISE_MAX])
-    new = factor * slow_share(parameter) * (1 - kept * kept)
+    new = factor * parameter[SLOW_SHARE] * (1 - kept * kept)
     to_n = mat_ne(x[POSITION_E])
     horizontal, vertical = new * values[VARIANCE_HORIZONTAL], new * values[VARIANCE_VERTICAL]
     _add(p, GNSS_ERROR.start, to_n, horizontal, horizontal, vertical)

@@ -87,7 +87,7 @@ def correlation_of(model: int, values: Vector, parameter: Vector) -> float:
 
 
 @compiled
-def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
+def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0912, PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
     model, values = params.models[source], row["values"]

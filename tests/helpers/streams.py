@@ -38,7 +38,7 @@ T0 = 1_700_000_000 * SECOND
 MUNICH = (math.radians(48.1), math.radians(11.6), 520.0)  # rad, rad, m
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
-WHITE = {"position_correlation_s": 0.0, "velocity_correlation_s": 0.0, "stamp_sigma_ms": 0.0}  # of a receiver as `measurements` has it
+WHITE = {"position_correlation_s": 0.0, "velocity_correlation_s": 0.0, "stamp_sigma_ms": 0.0}  # as `measurements` has it
 PULLS_AWAY_S = 3.0  # when drives that begin at rest pull away
 Curve = Callable[[Array], Array]
 

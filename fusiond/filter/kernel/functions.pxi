@@ -410,7 +410,7 @@ cdef void gnss_error_carry(State* state, int64_t source, double* values, Paramet
         for _i in range(n):
             (p + (18 + i))[_i * n] *= kept
     factor = source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9])
-    new = ((factor * gnss_position_slow_share(parameter)) * (1 - (kept * kept)))
+    new = ((factor * parameter[7]) * (1 - (kept * kept)))
     wgs84_mat_ne(x, to_n)
     horizontal, vertical = (new * values[3]), (new * values[4])
     gnss_error__add(p, 18, to_n, horizontal, horizontal, vertical)
@@ -1547,9 +1547,6 @@ cdef bint barometric_height_observe(State* state, double* row, double* parameter
 
 # ---------------- fusiond.filter.observations.gnss_position
 
-cdef double gnss_position_slow_share(double* parameter) noexcept nogil:
-    return ((1 - 0.2) if (parameter[5] > 0) else 0.0)
-
 cdef bint gnss_position_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double* x
     cdef double to_n[3 * 3]
@@ -1586,7 +1583,7 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
     for _i in range(3):
         off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
-    slow = gnss_position_slow_share(parameter)
+    slow = parameter[7]
     if (slow > 0):
         for _i in range(3):
             off_e[_i] -= (x + 19)[_i]

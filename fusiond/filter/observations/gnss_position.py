@@ -49,7 +49,7 @@ TYPE_OF_FIX = 5  # values: GPS_FIX_TYPE
 
 STAMP_SIGMA = 6  # s, parameters
 ERROR_TIME = 5  # s, parameters: over which the slow part of the error stays the same; 0: it is all white
-WHITE_SHARE = 0.2  # of the variance, where a part is slow
+SLOW_SHARE = 7  # parameters: of the variance
 
 HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
 
@@ -60,19 +60,14 @@ def parameters(gnss: Gnss) -> Array:
     row[CALIBRATED] = float(calibrated(gnss))
     row[RESETS] = POSITION.start
     row[ERROR_TIME] = gnss.position_correlation_s
+    row[SLOW_SHARE] = 1 - gnss.position_white_share if gnss.position_correlation_s > 0 else 0.0
     row[STAMP_SIGMA] = gnss.stamp_sigma_ms * 1e-3
     return row
 
 
-@compiled
-def slow_share(parameter: Vector) -> float:
-    """Share of a fix's variance that is the slow error's (fusiond.filter.gnss_error); the rest is white."""
-    return 1 - WHITE_SHARE if parameter[ERROR_TIME] > 0 else 0.0
-
-
 def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
-    """Place (3,) earth-fixed [m], variances horizontal and vertical [m^2], fix type. The sigma is the receiver's own, where it
-    gives one, but never below the configured one of the fix type. Raises Unusable."""
+    """Place (3,) earth-fixed [m], variances horizontal and vertical [m^2], fix type. The sigma is the receiver's own,
+    where it gives one, but never below the configured one of the fix type. Raises Unusable."""
     within((fix.latitude,), math.pi / 2, "impossible position")
     within((fix.longitude,), 2 * math.pi, "impossible position")
     if not HEIGHT_LIMITS[0] <= fix.height <= HEIGHT_LIMITS[1]:
@@ -102,7 +97,7 @@ def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observatio
         seen.jacobian[i, POSITION] = to_n[i]
     skew_rows(to_n, lever_e, -1.0, 3, seen.jacobian, ATTITUDE.start)
     off_e = row[PLACE_E] - x[POSITION_E] - lever_e + x[VELOCITY_E] * delay
-    slow = slow_share(parameter)
+    slow = parameter[SLOW_SHARE]
     if slow > 0:
         off_e -= x[GNSS_ERROR_E]
         for i in range(3):

@@ -12,7 +12,6 @@ import pytest
 from fusiond.events import GnssPosition, Measurement
 from fusiond.filter import gnss_error
 from fusiond.filter.observations import gnss_position
-from fusiond.filter.observations.gnss_position import WHITE_SHARE
 from fusiond.filter.observations.model import VALUES, Observation
 from fusiond.filter.parameters import Parameters, make_parameters
 from fusiond.filter.rows import Outcome
@@ -34,7 +33,7 @@ from fusiond.maths.wgs84 import geodetic, mat_ne
 from fusiond.units import SECOND
 from tests.helpers.streams import MUNICH, T0, apply, config, drive, fuse, measurements, running_state, town
 
-TAU = 20.0  # s
+TAU, WHITE_SHARE = 20.0, 0.2  # s; the default
 SLOW = 1 - WHITE_SHARE
 GNSS: dict[str, Any] = {"position_correlation_s": TAU, "position_sigma_m": 2.0, "height_sigma_m": 3.0, "stamp_sigma_ms": 0.0}
 PARAMS = make_parameters(config(gnss=GNSS))
@@ -215,7 +214,7 @@ def test_what_stamps_are_off_by_lasts_along_the_track() -> None:
 
 @pytest.mark.parametrize(("offset_n", "moves"), [((0.3, 0.2, 60.0), "place"), ((50.0, 0.0, 0.3), "height")])
 def test_height_and_place_are_gated_apart(offset_n: tuple[float, float, float], moves: str, compiled: bool) -> None:
-    """A fix whose height is off by 60 m still corrects the place, and the other way round; the row says what the place was."""
+    """A fix whose height is off by 60 m still corrects the place, and the other way round; the row tells of the place."""
     state = begun()
     state.covariance[:] = np.diag([1.0] * 3 + [1e-12] * (state.size - 3))
     to_n = mat_ne(state.nominal[POSITION_E])

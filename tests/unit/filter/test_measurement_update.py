@@ -138,8 +138,8 @@ def ill_conditioned(rng: np.random.Generator) -> Array:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_joseph_form_keeps_an_ill_conditioned_covariance_positive(compiled: bool, seed: int) -> None:
-    """A speed of 1 um/s on a kilometre a second of doubt: the short form P - K H P leaves noise above the fix's variance, of either
-    sign; the filter's form leaves that variance, and a covariance that is positive to rounding."""
+    """A speed of 1 um/s on a kilometre a second of doubt: the short form P - K H P leaves noise above its variance, of
+    either sign; the filter's form leaves that variance, and a covariance that is positive to rounding."""
     state = running_state(np.random.default_rng(seed))
     p = ill_conditioned(np.random.default_rng(seed))
     state.covariance[:] = p
