@@ -16,6 +16,7 @@ from fusiond.filter.observations.model import VALUES, Observation
 from fusiond.filter.parameters import Parameters, make_parameters
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
+    CALIBRATIONS,
     GNSS_ERROR,
     GNSS_ERROR_E,
     NEVER,
@@ -28,6 +29,7 @@ from fusiond.filter.state import (
     FilterState,
     T,
 )
+from fusiond.filter.stored_state import stored_state
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import geodetic, mat_ne
 from fusiond.units import SECOND
@@ -113,6 +115,13 @@ def test_without_a_correlation_time_there_is_none() -> None:
     assert head.stamps[T_GNSS_ERROR] != NEVER  # the start has placed it
     np.testing.assert_array_equal(head.nominal[GNSS_ERROR_E], 0.0)
     np.testing.assert_array_equal(head.covariance[GNSS_ERROR], 0.0)
+
+
+def test_it_is_not_stored() -> None:
+    kept = stored_state(begun(), config(gnss=GNSS))
+    sky = slice(GNSS_ERROR.start - CALIBRATIONS, GNSS_ERROR.stop - CALIBRATIONS)
+    assert kept.calibrations[sky] == kept.calibration_variances[sky] == [0.0, 0.0, 0.0]
+    assert all(kept.calibration_variances[: sky.start])
 
 
 def placed(axes: int) -> FilterState:
