@@ -45,6 +45,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "interval_s": 0.2,
         "position_correlation_s": 0.0,
         "velocity_correlation_s": 0.0,
+        "stamp_sigma_ms": 0.0,
     },
     "wheel": {"unsigned": False, "sigma_mps": 0.05, "least_mps": 0.0},
 }

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from fusiond.config.schema import Config, Wheel, wheel_groups
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
-from fusiond.filter.observations.gnss_position import WHITE_SHARE
 from fusiond.filter.parameters import make_parameters, scale_state
 from fusiond.filter.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
 from fusiond.maths.typed import Array
@@ -297,8 +296,8 @@ class Sensors:
         sigma = np.array([gnss.position_sigma_m, gnss.position_sigma_m, gnss.height_sigma_m])
         position = self._white(len(t))
         if gnss.position_correlation_s:
-            slow = gauss_markov(len(t), gnss.interval_s, gnss.position_correlation_s, self.random)
-            position = np.sqrt(WHITE_SHARE) * position + np.sqrt(1 - WHITE_SHARE) * slow
+            slow, white = self._noise(len(t), gnss.interval_s, gnss.position_correlation_s), gnss.position_white_share
+            position = np.sqrt(white) * position + np.sqrt(1 - white) * slow
         position *= sigma
         return position, self._noise(len(t), gnss.interval_s, gnss.velocity_correlation_s) * gnss.velocity_sigma_mps
 

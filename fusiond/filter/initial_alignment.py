@@ -42,6 +42,7 @@ from fusiond.filter.state import (
     FIRST_VELOCITY_N,
     FIX_E,
     FIX_SLOW_SHARE,
+    FIX_TYPE,
     FIX_VARIANCE,
     FORCE_B,
     GNSS_ERROR,
@@ -119,7 +120,8 @@ def gather(state: FilterState, row: Row, params: Parameters) -> None:
     if model == GNSS_POSITION:
         auxiliary[FIX_E] = values[gnss_position.PLACE_E]
         auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
-        auxiliary[FIX_SLOW_SHARE] = gnss_position.slow_share(params.model_parameters[source])
+        auxiliary[FIX_SLOW_SHARE] = params.model_parameters[source, gnss_position.SLOW_SHARE]
+        state.memory[source, FIX_TYPE] = values[gnss_position.TYPE_OF_FIX]
         stamps[T_FIX] = t_ns
         _start_by_position(state, source, params)
     elif model == GNSS_VELOCITY:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusiond.filter import gnss_error, rivals, source_health
@@ -45,6 +47,8 @@ from fusiond.filter.state import (
 from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
 from fusiond.maths.wgs84 import mat_ne
 
+HORIZONTAL = 2  # axes of a fix that are judged together; its height is judged apart
+DOUBT_TIME = 30.0  # s: a height that is rejected for so long is believed
 OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
 
 
@@ -88,7 +92,7 @@ def _carry_error(state: FilterState, source: int, values: Vector, params: Parame
             if state.bank[slot, 0] > 0:
                 rival = state.hypothesis(slot)
                 gnss_error.carry(rival, source, values, params)
-    gnss_error.note(state, source, params)
+    gnss_error.note(state, source, values, params)
 
 
 @compiled
@@ -116,6 +120,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         learnt[a] = given[a] * factor
         row["innovation"][a] = seen.innovation[a]
         row["variance"][a] = spread[a, a] + learnt[a]
+    if model == GNSS_POSITION:
+        m = seen.m = HORIZONTAL
     weight = factor_of(stamps, model, values, parameter, t_ns)
     if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
         stamps[T_FUSED] = NEVER
@@ -166,6 +172,12 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         _reset_offset(state, seen)  # a barometer that is off by a constant has another offset now: weather, a window
         source_health.begin(memory)
         fused = True
+    if model == GNSS_POSITION:
+        _fuse_height(state, source, values, factor * noisy, elapsed, trusted or fused, params)
+        for slot in range(rivals.RIVALS):
+            if state.bank[slot, 0] > 0 and rivals.uses(state, slot, source, params):
+                rival = state.hypothesis(slot)
+                _fuse_height(rival, source, values, factor * noisy, elapsed, True, params)
     if fused:
         stamps[T_REJECTED] = NEVER
         stamps[T_FUSED] = t_ns
@@ -236,6 +248,8 @@ def _fuse_rivals(
                 continue
             project(rival, seen, across, spread)
             share_noise(rival, seen, parameter)
+            if model == GNSS_POSITION:
+                seen.m = HORIZONTAL
             for a in range(seen.m):
                 seen.variance[a] *= factor
             own = rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
@@ -250,6 +264,33 @@ def _fuse_rivals(
             if main > 0:
                 best = max(best, own / main)
     return best
+
+
+@compiled
+def _fuse_height(
+    state: FilterState, source: int, values: Vector, stretch: float, elapsed: float, trusted: bool, params: Parameters
+) -> None:
+    """Fuse the height of a fix through a gate of its own: height and horizontal place may each be off alone. Its variance is
+    `stretch` times the configured one. While it is rejected the own height becomes uncertain, until it fits."""
+    parameter = params.model_parameters[source]
+    seen = Observation(state.size)
+    if not observe(state, GNSS_POSITION, values, parameter, seen):
+        return
+    share_noise(state, seen, parameter)
+    seen.m = 1
+    seen.jacobian[0] = seen.jacobian[2]
+    seen.innovation[0], seen.common[0] = seen.innovation[2], seen.common[2]
+    seen.variance[0] = seen.variance[2] * stretch
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    project(state, seen, across, spread)
+    ratio, fused = update_projected(state, seen, params.gates[1], 1.0, trusted, parameter[CLUTTER], across, spread)
+    if fused or not trusted or not ratio < math.inf:
+        return
+    grown = seen.innovation[0] * seen.innovation[0] / params.gates[1] * min(elapsed / DOUBT_TIME, 1.0)
+    down = seen.jacobian[0, POSITION]
+    for i in range(3):
+        for j in range(3):
+            state.covariance[POSITION.start + i, POSITION.start + j] += grown * (down[i] * down[j])
 
 
 @compiled

@@ -107,6 +107,7 @@ BEFORE = _memory.block(4)  # the probabilities before the look that the newest r
 EXCLUDED = _memory.one()  # 1: a receiver that was found to lie
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
 FROZEN_PLACE = _memory.one()  # which axis of an inertial sensor is frozen (source_health.INERTIAL_AXES); 0: none
+FIX_TYPE = _memory.one()  # of a receiver's last fix; 0 before the first
 MEMORY_SIZE = _memory.size
 
 # Stamps and counts: places in FilterState.stamps

@@ -294,7 +294,7 @@ def _choose(state: FilterState, row: Row, imu: Row | None, params: Parameters) -
             heading_bank.fuse_measurement(state, i, model, values, parameter, factor, params)
     own[T_FUSED] = t_ns
     if model == GNSS_POSITION:
-        gnss_error.note(state, source, params)
+        gnss_error.note(state, source, values, params)
         stamps[T_POSITION] = t_ns
     heading_bank.collapse_if_close(state, params)
 

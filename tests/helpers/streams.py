@@ -38,7 +38,7 @@ T0 = 1_700_000_000 * SECOND
 MUNICH = (math.radians(48.1), math.radians(11.6), 520.0)  # rad, rad, m
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
-WHITE = {"position_correlation_s": 0.0, "velocity_correlation_s": 0.0}  # of a receiver as `measurements` has it
+WHITE = {"position_correlation_s": 0.0, "velocity_correlation_s": 0.0, "stamp_sigma_ms": 0.0}  # as `measurements` has it
 PULLS_AWAY_S = 3.0  # when drives that begin at rest pull away
 Curve = Callable[[Array], Array]
 
@@ -189,7 +189,8 @@ def running_state(
     x[VELOCITY_E] = rng.normal(0.0, 10.0, 3)
     x[QUATERNION_EB] = quaternion(matrix_from_euler(*(float(a) for a in rng.uniform(-1.5, 1.5, 3))))
     root = rng.normal(0.0, 1.0, (state.size, state.size)) + 2 * np.eye(state.size)
-    scale = np.repeat([1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1])[:size]
+    sigmas, widths = [1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1]
+    scale = np.repeat(sigmas, widths)[:size]
     covariance = scale[:, None] * (root @ root.T) * scale / size
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)

@@ -383,6 +383,7 @@ cdef void gnss_error_carry(State* state, int64_t source, double* values, Paramet
     cdef double* x
     cdef double* p
     cdef double kept
+    cdef double last
     cdef int64_t i
     cdef int _i
     cdef double factor
@@ -390,13 +391,16 @@ cdef void gnss_error_carry(State* state, int64_t source, double* values, Paramet
     cdef double to_n[3 * 3]
     cdef double horizontal
     cdef double vertical
+    cdef double late
+    cdef int64_t j
+    cdef double along
     parameter = params.model_parameters + (source) * PARAMETERS
     x = state.nominal
     p = state.covariance
     if (not (parameter[5] > 0)):
         return
-    kept = 0.0
-    if (state.stamps[5] != (<int64_t>-4611686018427387904)):
+    kept, last = 0.0, state.memory[(source) * MEMORY_SIZE + 21]
+    if ((state.stamps[5] != (<int64_t>-4611686018427387904)) and ((last == 0) or (last == values[5]))):
         kept = portable_exp(((-((state.stamps[0] - state.stamps[5]) * 1e-09)) / parameter[5]))
     for i in range(3):
         x[(19 + i)] *= kept
@@ -406,12 +410,18 @@ cdef void gnss_error_carry(State* state, int64_t source, double* values, Paramet
         for _i in range(n):
             (p + (18 + i))[_i * n] *= kept
     factor = source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9])
-    new = ((factor * gnss_position_slow_share(parameter)) * (1 - (kept * kept)))
+    new = ((factor * parameter[7]) * (1 - (kept * kept)))
     wgs84_mat_ne(x, to_n)
     horizontal, vertical = (new * values[3]), (new * values[4])
     gnss_error__add(p, 18, to_n, horizontal, horizontal, vertical)
+    late = ((new * parameter[6]) * parameter[6])
+    for i in range(3):
+        for j in range(3):
+            along = (x[(3 + i)] * x[(3 + j)])
+            p[((18 + i)) * n + (18 + j)] += (late * along)
 
-cdef void gnss_error_note(State* state, int64_t source, Parameters* params) noexcept nogil:
+cdef void gnss_error_note(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    state.memory[(source) * MEMORY_SIZE + 21] = values[5]
     if (params.model_parameters[(source) * PARAMETERS + 5] > 0):
         state.stamps[5] = state.stamps[0]
 
@@ -421,6 +431,7 @@ cdef void gnss_error_with_whole_error(State* state, int64_t source, double* valu
     cdef double to_n[3 * 3]
     cdef double share
     cdef double error_n[3]
+    cdef double late_n[3]
     cdef int64_t i
     cdef double own
     cdef int64_t j
@@ -432,16 +443,18 @@ cdef void gnss_error_with_whole_error(State* state, int64_t source, double* valu
     if (not (parameter[5] > 0)):
         return
     wgs84_mat_ne(state.nominal, to_n)
-    share = (source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9]) * gnss_position_slow_share(parameter))
+    share = (source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9]) * parameter[7])
     rotation_times(to_n, state.nominal + 19, error_n)
+    rotation_times(to_n, state.nominal + 3, late_n)
     for i in range(3):
         innovation[i] += error_n[i]
         own = 0.0
         for j in range(3):
             for k in range(3):
                 own += ((to_n[(i) * 3 + j] * p[((18 + j)) * n + (18 + k)]) * to_n[(i) * 3 + k])
-        variance = (share * (values[4] if (i == 2) else values[3]))
-        _t1 = (variance - own)
+        variance = (values[4] if (i == 2) else values[3])
+        variance += portable_square((parameter[6] * late_n[i]))
+        _t1 = ((share * variance) - own)
         spread[(i) * 3 + i] += (0.0 if 0.0 > _t1 else _t1)
 
 cdef void gnss_error_place(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
@@ -449,38 +462,80 @@ cdef void gnss_error_place(State* state, int64_t source, double* values, Observa
     cdef double* p
     cdef double to_n[3 * 3]
     cdef bint slow
-    cdef int _i
+    cdef double off[3]
+    cdef double variance[3]
+    cdef double common[3]
     cdef double _t1[3]
+    cdef int _i
+    cdef int64_t a
     cdef int64_t i
     cdef int64_t j
-    cdef double variance
+    cdef double _t2[3]
+    cdef double along[3]
     x = state.nominal
     p = state.covariance
     wgs84_mat_ne(x, to_n)
     slow = (params.model_parameters[(source) * PARAMETERS + 5] > 0)
+    memset(off, 0, 3 * sizeof(double))
+    memset(variance, 0, 3 * sizeof(double))
+    memset(common, 0, 3 * sizeof(double))
     if slow:
+        rotation_times(to_n, x + 19, _t1)
         for _i in range(3):
-            x[_i] += (x + 19)[_i]
+            off[_i] = _t1[_i]
         state.stamps[5] = (<int64_t>-4611686018427387904)
         gnss_error_carry(state, source, values, params)
-    rotation_transposed_times(to_n, seen.innovation, _t1)
+        gnss_error_note(state, source, values, params)
+    for a in range(seen.m):
+        off[a] += seen.innovation[a]
+        variance[a], common[a] = seen.variance[a], seen.common[a]
+    for a in range(seen.m, 3):
+        off[a] = 0.0
+        for i in range(3):
+            for j in range(3):
+                variance[a] += ((to_n[(a) * 3 + i] * p[((0 + i)) * n + (0 + j)]) * to_n[(a) * 3 + j])
+    rotation_transposed_times(to_n, off, _t2)
     for _i in range(3):
-        x[_i] += _t1[_i]
+        x[_i] += _t2[_i]
     for i in range(3):
         for _i in range(n):
             (p + ((0 + i)) * n)[_i] = 0.0
         for _i in range(n):
             (p + (0 + i))[_i * n] = 0.0
-    gnss_error__add(p, 0, to_n, seen.variance[0], seen.variance[1], seen.variance[2])
-    if (not slow):
-        return
-    gnss_error_note(state, source, params)
+    gnss_error__add(p, 0, to_n, variance[0], variance[1], variance[2])
+    rotation_transposed_times(to_n, common, along)
     for i in range(3):
         for j in range(3):
-            variance = p[((18 + i)) * n + (18 + j)]
-            p[((0 + i)) * n + (0 + j)] += variance
-            p[((0 + i)) * n + (18 + j)] = (-variance)
-            p[((18 + i)) * n + (0 + j)] = (-variance)
+            p[((0 + i)) * n + (0 + j)] += (along[i] * along[j])
+    if slow:
+        gnss_error__tie(p, to_n, seen.m)
+
+cdef void gnss_error__tie(double* p, double* to_n, int64_t axes) noexcept nogil:
+    cdef double along[3 * 3]
+    cdef double across[3 * 3]
+    cdef int64_t a
+    cdef int64_t i
+    cdef int64_t j
+    cdef int64_t k
+    memset(along, 0, 3 * 3 * sizeof(double))
+    memset(across, 0, 3 * 3 * sizeof(double))
+    for a in range(axes):
+        for i in range(3):
+            for j in range(3):
+                along[(i) * 3 + j] += (to_n[(a) * 3 + i] * to_n[(a) * 3 + j])
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                across[(i) * 3 + j] += (along[(i) * 3 + k] * p[((18 + k)) * n + (18 + j)])
+    for i in range(3):
+        for j in range(3):
+            p[((0 + i)) * n + (18 + j)] = (-across[(i) * 3 + j])
+            p[((18 + j)) * n + (0 + i)] = (-across[(i) * 3 + j])
+    for i in range(3):
+        for j in range(i, 3):
+            for k in range(3):
+                p[((0 + i)) * n + (0 + j)] += (across[(i) * 3 + k] * along[(k) * 3 + j])
+            p[((0 + j)) * n + (0 + i)] = p[((0 + i)) * n + (0 + j)]
 
 cdef void gnss_error__add(double* p, int64_t block, double* to_n, double north, double east, double down) noexcept nogil:
     cdef int64_t i
@@ -1042,7 +1097,7 @@ cdef void measurement__carry_error(State* state, int64_t source, double* values,
             if (state.bank[(slot) * BLOCK + 0] > 0):
                 rival = hypothesis_of(state, slot)
                 gnss_error_carry(&rival, source, values, params)
-    gnss_error_note(state, source, params)
+    gnss_error_note(state, source, values, params)
 
 cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* params) noexcept nogil:
     cdef int64_t source
@@ -1062,6 +1117,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double learnt[3]
     cdef double factor
     cdef int64_t a
+    cdef int64_t _t1
     cdef double weight
     cdef bint by_rivals
     cdef bint doubtful
@@ -1076,14 +1132,16 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double noisy
     cdef bint heard
     cdef double fits
-    cdef (double, bint) _t1
+    cdef (double, bint) _t2
     cdef double ratio
     cdef bint fused
-    cdef double _t2
+    cdef double _t3
     cdef double best
     cdef double main
     cdef double gained
-    cdef double _t3
+    cdef double _t4
+    cdef int64_t slot
+    cdef State rival
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
     model = params.models[source]
     values = row.values
@@ -1106,6 +1164,10 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         learnt[a] = (given[a] * factor)
         row.innovation[a] = seen.innovation[a]
         row.variance[a] = (spread[(a) * 3 + a] + learnt[a])
+    if (model == 0):
+        _t1 = 2
+        m = _t1
+        seen.m = _t1
     weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
     if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
         stamps[1] = (<int64_t>-4611686018427387904)
@@ -1134,20 +1196,20 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         seen.variance[a] = (learnt[a] * noisy)
     heard = ((not doubtful) and (not source_health_is_stuck(memory)) and (trusted or by_rivals))
     fits = (rivals_likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0)
-    _t1 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
-    ratio = _t1[0]
-    fused = _t1[1]
-    _t2 = ratio
-    row.ratio = _t2
-    memory[2] = _t2
+    _t2 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
+    ratio = _t2[0]
+    fused = _t2[1]
+    _t3 = ratio
+    row.ratio = _t3
+    memory[2] = _t3
     best = 0.0
     if ((state.stamps[22] > 0) and heard and (fits > 0)):
         best = ((0.1 * rivals_unread(seen.variance, weight, m, spread)) / fits)
     if ((state.stamps[22] > 0) and heard):
         main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
         gained = ((source_health_odds_of_bias(memory) / before) if ((model == 1) and (before > 0)) else 0.0)
-        _t3 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
-        best = (_t3 if _t3 > best else best)
+        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
+        best = (_t4 if _t4 > best else best)
         if ((model == 2) and (state.bank[(3) * BLOCK + 0] > 0)):
             state.bank[(3) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < best else best)
     if (by_rivals and (not doubtful)):
@@ -1162,6 +1224,12 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         measurement__reset_offset(state, &seen)
         source_health_begin(memory)
         fused = True
+    if (model == 0):
+        measurement__fuse_height(state, source, values, (factor * noisy), elapsed, (trusted or fused), params)
+        for slot in range(4):
+            if ((state.bank[(slot) * BLOCK + 0] > 0) and rivals_uses(state, slot, source, params)):
+                rival = hypothesis_of(state, slot)
+                measurement__fuse_height(&rival, source, values, (factor * noisy), elapsed, True, params)
     if fused:
         stamps[2] = (<int64_t>-4611686018427387904)
         stamps[1] = t_ns
@@ -1227,6 +1295,8 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
                 continue
             measurement_update_project(&rival, &seen, across, spread)
             measurement_share_noise(&rival, &seen, parameter)
+            if (model == 0):
+                seen.m = 2
             for a in range(seen.m):
                 seen.variance[a] *= factor
             own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
@@ -1243,6 +1313,42 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
                 _t3 = (own / main)
                 best = (_t3 if _t3 > best else best)
     return best
+
+cdef void measurement__fuse_height(State* state, int64_t source, double* values, double stretch, double elapsed, bint trusted, Parameters* params) noexcept nogil:
+    cdef double* parameter
+    cdef Observation seen
+    cdef int _i
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    cdef (double, bint) _t1
+    cdef double ratio
+    cdef bint fused
+    cdef double _t2
+    cdef double grown
+    cdef double* down
+    cdef int64_t i
+    cdef int64_t j
+    parameter = params.model_parameters + (source) * PARAMETERS
+    if (not observations_observe(state, 0, values, parameter, &seen)):
+        return
+    measurement_share_noise(state, &seen, parameter)
+    seen.m = 1
+    for _i in range(n):
+        (seen.jacobian + (0) * n)[_i] = (seen.jacobian + (2) * n)[_i]
+    seen.innovation[0], seen.common[0] = seen.innovation[2], seen.common[2]
+    seen.variance[0] = (seen.variance[2] * stretch)
+    measurement_update_project(state, &seen, across, spread)
+    _t1 = measurement_update_update_projected(state, &seen, params.gates[1], 1.0, trusted, parameter[12], across, spread)
+    ratio = _t1[0]
+    fused = _t1[1]
+    if (fused or (not trusted) or (not (ratio < INFINITY))):
+        return
+    _t2 = (elapsed / 30.0)
+    grown = (((seen.innovation[0] * seen.innovation[0]) / params.gates[1]) * (1.0 if 1.0 < _t2 else _t2))
+    down = seen.jacobian + (0) * n
+    for i in range(3):
+        for j in range(3):
+            state.covariance[((0 + i)) * n + (0 + j)] += (grown * (down[i] * down[j]))
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
     cdef double odds
@@ -1333,7 +1439,7 @@ cdef void measurement_update_project(State* state, Observation* seen, double* ac
                 axpy(across + (a) * n, seen.jacobian[(a) * n + k], state.covariance + (k) * n)
     for a in range(seen.m):
         for i in range((a + 1)):
-            _t1 = linear_dot(seen.jacobian + (a) * n, across + (i) * n)
+            _t1 = (linear_dot(seen.jacobian + (a) * n, across + (i) * n) + (seen.common[a] * seen.common[i]))
             spread[(a) * 3 + i] = _t1
             spread[(i) * 3 + a] = _t1
 
@@ -1441,6 +1547,7 @@ cdef void measurement_update__joseph(double* p, Observation* seen, double factor
     cdef int _i
     cdef double kept[3 * n]
     cdef int64_t k
+    cdef int64_t i
     for a in range(seen.m):
         for _i in range(n):
             axpy(p + _i * n, (-(across + (a) * n)[_i]), gain + (a) * n)
@@ -1451,6 +1558,8 @@ cdef void measurement_update__joseph(double* p, Observation* seen, double factor
                 axpy(kept + (a) * n, (-seen.jacobian[(a) * n + k]), p + (k) * n)
     for a in range(seen.m):
         axpy(kept + (a) * n, (factor * seen.variance[a]), gain + (a) * n)
+        for i in range((seen.m if (seen.common[a] != 0.0) else 0)):
+            axpy(kept + (a) * n, (seen.common[a] * seen.common[i]), gain + (i) * n)
     for a in range(seen.m):
         for _i in range(n):
             axpy(p + _i * n, (gain + (a) * n)[_i], kept + (a) * n)
@@ -1812,9 +1921,6 @@ cdef bint barometric_height_observe(State* state, double* row, double* parameter
 
 # ---------------- fusiond.filter.observations.gnss_position
 
-cdef double gnss_position_slow_share(double* parameter) noexcept nogil:
-    return ((1 - 0.2) if (parameter[5] > 0) else 0.0)
-
 cdef bint gnss_position_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
     cdef double* x
     cdef double to_n[3 * 3]
@@ -1828,7 +1934,9 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     cdef double off_e[3]
     cdef double slow
     cdef double _t4[3]
-    cdef double _t5
+    cdef double _t5[3]
+    cdef double _t6
+    cdef double _t7
     x = state.nominal
     wgs84_mat_ne(x, to_n)
     model_begin(seen, 3)
@@ -1849,7 +1957,7 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
     for _i in range(3):
         off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
-    slow = gnss_position_slow_share(parameter)
+    slow = parameter[7]
     if (slow > 0):
         for _i in range(3):
             off_e[_i] -= (x + 19)[_i]
@@ -1859,9 +1967,13 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     rotation_times(to_n, off_e, _t4)
     for _i in range(3):
         seen.innovation[_i] = _t4[_i]
-    _t5 = ((1 - slow) * row[3])
-    seen.variance[0] = _t5
-    seen.variance[1] = _t5
+    rotation_times(to_n, x + 3, _t5)
+    _t6 = (parameter[6] * sqrt((1 - slow)))
+    for _i in range(3):
+        seen.common[_i] = (_t5[_i] * _t6)
+    _t7 = ((1 - slow) * row[3])
+    seen.variance[0] = _t7
+    seen.variance[1] = _t7
     seen.variance[2] = ((1 - slow) * row[4])
     return True
 
@@ -2028,9 +2140,11 @@ cdef bint gnss_yaw_observe(State* state, double* row, double* parameter, Observa
 # ---------------- fusiond.filter.observations.model
 
 cdef void model_begin(Observation* seen, int64_t axes) noexcept nogil:
-    cdef int64_t a
     cdef int _i
+    cdef int64_t a
     seen.m = axes
+    for _i in range(3):
+        seen.common[_i] = 0.0
     for a in range(axes):
         for _i in range(n):
             (seen.jacobian + (a) * n)[_i] = 0.0
@@ -2152,10 +2266,12 @@ cdef double non_holonomic_observe_at_any_speed(State* state, double* parameter, 
 cdef void non_holonomic__observe(State* state, double* parameter, Observation* seen, double* out) noexcept nogil:
     cdef double by[3 * n]
     cdef double velocity_v[3]
-    cdef int64_t i
     cdef int _i
+    cdef int64_t i
     model_point_velocity_v(state, parameter, 3, by, velocity_v)
     seen.m = 2
+    for _i in range(3):
+        seen.common[_i] = 0.0
     for i in range(2):
         for _i in range(n):
             (seen.jacobian + (i) * n)[_i] = (by + ((1 + i)) * n)[_i]
@@ -2225,6 +2341,8 @@ cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Obs
             variance += (((100.0 * reading) * reading) * (1 - (sure * sure)))
             reading *= sure
     seen.m = 1
+    for _i in range(3):
+        seen.common[_i] = 0.0
     seen.innovation[0] = (reading - (scale * speed))
     seen.variance[0] = variance
     return True
@@ -3175,7 +3293,7 @@ cdef void step__choose(State* state, Row* row, Row* imu, Parameters* params) noe
             heading_bank_fuse_measurement(state, i, model, values, parameter, factor, params)
     own[1] = t_ns
     if (model == 0):
-        gnss_error_note(state, source, params)
+        gnss_error_note(state, source, values, params)
         stamps[4] = t_ns
     heading_bank_collapse_if_close(state, params)
 

@@ -3,7 +3,7 @@
 cdef enum:
     NOMINAL_SIZE = 32
     AUXILIARY_SIZE = 68
-    MEMORY_SIZE = 21
+    MEMORY_SIZE = 22
     STAMPS_SIZE = 24
     SOURCE_STAMPS_SIZE = 4
     HYPOTHESES = 13
@@ -31,6 +31,7 @@ cdef struct Observation:
     double innovation[3]
     double jacobian[2 * n + WIDE_SIZE]
     double variance[3]
+    double common[3]
 
 cdef struct Row:
     int64_t t_ns
