@@ -124,7 +124,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     noisy = source_health.noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = learnt[a] * noisy
-    ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
+    gate, clutter, scaled = params.gates[m], parameter[CLUTTER], model == WHEEL_SPEED
+    ratio, fused = update_projected(state, seen, gate, weight, trusted, clutter, across, spread, scaled)
     row["ratio"] = memory[LAST_RATIO] = ratio
     if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, params):
         _reset(state, source, seen, int(parameter[RESETS]))

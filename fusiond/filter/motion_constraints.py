@@ -162,7 +162,7 @@ def _apply(state: FilterState, which: int, params: Parameters, factor: float) ->
     if not observe_constraint(state, which, params, seen):
         return False
     with_rate_noise(state, seen)
-    ratio, fused = update(state, seen, params.gates[seen.m], factor)
+    ratio, fused = update(state, seen, params.gates[seen.m], factor, True, 0.0, True)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     if fused:
         state.stamps[CONSTRAINT_FUSED.start + which] += 1

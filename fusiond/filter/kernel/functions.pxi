@@ -408,7 +408,7 @@ cdef void heading_bank_fuse(State* state, int64_t i, State* hypothesis, Observat
     measurement_update_project(hypothesis, seen, across, spread)
     if weighed:
         heading_bank_weigh(state, i, seen, factor, spread)
-    measurement_update_update_projected(hypothesis, seen, params.gates[seen.m], factor, True, 0.01, across, spread)
+    measurement_update_update_projected(hypothesis, seen, params.gates[seen.m], factor, True, 0.01, across, spread, False)
 
 cdef void heading_bank_fuse_measurement(State* state, int64_t i, int64_t model, double* values, double* parameter, double factor, Parameters* params) noexcept nogil:
     cdef State hypothesis
@@ -688,6 +688,9 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef bint known
     cdef bint trusted
     cdef double noisy
+    cdef double gate
+    cdef double clutter
+    cdef bint scaled
     cdef (double, bint) _t1
     cdef double ratio
     cdef bint fused
@@ -732,7 +735,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     noisy = source_health_noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = (learnt[a] * noisy)
-    _t1 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
+    gate, clutter, scaled = params.gates[m], parameter[12], (model == 2)
+    _t1 = measurement_update_update_projected(state, &seen, gate, weight, trusted, clutter, across, spread, scaled)
     ratio = _t1[0]
     fused = _t1[1]
     _t2 = ratio
@@ -922,13 +926,13 @@ cdef bint measurement_update_whiten(double* spread, double* innovation, double* 
         whitened[i] = (rest / lower[(i) * 3 + i])
     return True
 
-cdef (double, bint) measurement_update_update(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter) noexcept nogil:
+cdef (double, bint) measurement_update_update(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, bint given) noexcept nogil:
     cdef double across[3 * n]
     cdef double spread[3 * 3]
     measurement_update_project(state, seen, across, spread)
-    return measurement_update_update_projected(state, seen, gate, factor, trusted, clutter, across, spread)
+    return measurement_update_update_projected(state, seen, gate, factor, trusted, clutter, across, spread, given)
 
-cdef (double, bint) measurement_update_update_projected(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, double* across, double* spread) noexcept nogil:
+cdef (double, bint) measurement_update_update_projected(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, double* across, double* spread, bint given) noexcept nogil:
     cdef int64_t m
     cdef double* p
     cdef double whitened[3]
@@ -936,11 +940,12 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     cdef int64_t a
     cdef double ratio
     cdef double share
+    cdef double weighed[3 * 3]
     cdef double lower[3 * 3]
+    cdef double gain[3 * n]
+    cdef int _i
     cdef double before[n * n]
     cdef int64_t i
-    cdef int _i
-    cdef double gain[3 * n]
     cdef double error[n]
     cdef double mixed
     cdef double _t1
@@ -962,13 +967,20 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
         share = measurement_update_detection(distance, m, clutter)
         if (share < 1e-06):
             return (ratio, False)
-    if (not measurement_update_cholesky(spread, seen.variance, factor, m, lower)):
+    for a in range(m):
+        for _i in range(n):
+            (gain + (a) * n)[_i] = (across + (a) * n)[_i]
+        for _i in range(3):
+            (weighed + (a) * 3)[_i] = (spread + (a) * 3)[_i]
+    if given:
+        measurement_update_give_scale(p, m, gain, weighed)
+    if (not measurement_update_cholesky(weighed, seen.variance, factor, m, lower)):
         return (ratio, False)
     if (share < 1):
         for i in range(n):
             for _i in range(n):
                 (before + (i) * n)[_i] = (p + (i) * n)[_i]
-    measurement_update__solve(lower, across, m, gain)
+    measurement_update__solve(lower, m, gain)
     measurement_update__joseph(p, seen, factor, across, gain)
     memset(error, 0, n * sizeof(double))
     for a in range(m):
@@ -986,15 +998,13 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     measurement_update_inject(state, error)
     return (ratio, (share >= 0.5))
 
-cdef void measurement_update__solve(double* lower, double* across, int64_t m, double* gain) noexcept nogil:
+cdef void measurement_update__solve(double* lower, int64_t m, double* gain) noexcept nogil:
     cdef int64_t i
-    cdef int _i
     cdef int64_t k
+    cdef int _i
     cdef double _t1
     cdef double _t2
     for i in range(m):
-        for _i in range(n):
-            (gain + (i) * n)[_i] = (across + (i) * n)[_i]
         for k in range(i):
             axpy(gain + (i) * n, (-lower[(i) * 3 + k]), gain + (k) * n)
         _t1 = lower[(i) * 3 + i]
@@ -1006,6 +1016,22 @@ cdef void measurement_update__solve(double* lower, double* across, int64_t m, do
         _t2 = lower[(i) * 3 + i]
         for _i in range(n):
             (gain + (i) * n)[_i] /= _t2
+
+cdef void measurement_update_give_scale(double* p, int64_t m, double* across, double* spread) noexcept nogil:
+    cdef double variance
+    cdef double by[3]
+    cdef int64_t a
+    cdef int64_t i
+    variance = p[(15) * n + 15]
+    if (not (variance > 0)):
+        return
+    for a in range(m):
+        by[a] = across[(a) * n + 15]
+    for a in range(m):
+        axpy(across + (a) * n, ((-by[a]) / variance), p + (15) * n)
+        across[(a) * n + 15] = 0.0
+        for i in range(m):
+            spread[(a) * 3 + i] -= ((by[a] * by[i]) / variance)
 
 cdef void measurement_update__joseph(double* p, Observation* seen, double factor, double* across, double* gain) noexcept nogil:
     cdef int64_t a
@@ -1266,7 +1292,7 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* par
     if (not motion_constraints_observe_constraint(state, which, params, &seen)):
         return False
     model_with_rate_noise(state, &seen)
-    _t1 = measurement_update_update(state, &seen, params.gates[seen.m], factor, True, 0.0)
+    _t1 = measurement_update_update(state, &seen, params.gates[seen.m], factor, True, 0.0, True)
     ratio = _t1[0]
     fused = _t1[1]
     state.auxiliary[(32 + which)] = ratio
@@ -1674,9 +1700,7 @@ cdef void model_point_velocity_v(State* state, double* point_b, int64_t axes, do
 # ---------------- fusiond.filter.observations.non_holonomic
 
 cdef bint non_holonomic_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double velocity_v[3]
-    non_holonomic__observe(state, parameter, seen, velocity_v)
-    return (fabs(velocity_v[0]) >= parameter[5])
+    return (non_holonomic_observe_at_any_speed(state, parameter, seen) >= parameter[5])
 
 cdef double non_holonomic_observe_at_any_speed(State* state, double* parameter, Observation* seen) noexcept nogil:
     cdef double velocity_v[3]

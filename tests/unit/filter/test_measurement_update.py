@@ -225,7 +225,8 @@ def test_cholesky_and_solve() -> None:
         assert cholesky(spread, variance, factor, 3, lower)
         np.testing.assert_allclose(lower @ lower.T, matrix, atol=1e-12)
         assert not np.triu(lower, 1).any()
-        _solve(lower, right, 3, gain)
+        gain[:] = right
+        _solve(lower, 3, gain)
         np.testing.assert_allclose(matrix @ gain, right, atol=1e-12)
     for bad in (-np.eye(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.diag([1.0, math.nan]), np.diag([math.inf, 1.0])):
         assert not cholesky(bad, np.zeros(2), 1.0, 2, lower)
@@ -286,3 +287,32 @@ def test_difference_is_what_inject_adds(size: int) -> None:
     assert abs(difference(moved, state)[ATTITUDE]).max() > 0
     moved.nominal[QUATERNION_EB] *= -1  # the same attitude
     np.testing.assert_allclose(difference(moved, state), error, atol=1e-8)
+
+
+@pytest.mark.parametrize("variance", [1e-4, 0.0])
+def test_with_the_scale_given_the_gain_is_that_of_a_filter_that_knows_it(variance: float) -> None:
+    """The scale stays as it is, to the bit; the nominal state goes where a filter without that state would take it, and the
+    covariance is that plus what the scale's error does to it."""
+    random = np.random.default_rng(5)
+    state, known = FilterState(1), FilterState(1)
+    n, s = state.size, SCALE.start
+    half = random.normal(size=(n, n)) * 0.1
+    known.covariance[:] = half @ half.T
+    known.covariance[s], known.covariance[:, s] = 0.0, 0.0
+    owed = random.normal(size=n) * (variance > 0)  # what the other states owe to the scale's error
+    owed[s] = 1.0
+    state.covariance[:] = known.covariance + variance * np.outer(owed, owed)
+    jacobian = np.zeros((1, n))
+    jacobian[0, [3, 4, s]] = 1.0, 0.3, 20.0
+    seen = Observation.of(np.array([0.4]), jacobian, np.array([0.01]))
+    before = state.covariance[s, s]
+    gain = known.covariance @ jacobian[0] / (jacobian[0] @ known.covariance @ jacobian[0] + 0.01)
+    update(state, seen, ALWAYS, given=True)
+    update(known, seen, ALWAYS)
+    assert state.nominal[WHEEL_SCALE] == 0.0
+    assert state.covariance[s, s] == pytest.approx(before, rel=1e-12)
+    np.testing.assert_allclose(state.nominal, known.nominal, atol=1e-12)
+    left = owed - gain * (jacobian[0] @ owed)
+    without_turn = state.covariance[9:15, 9:15]  # `turn_along` changes position and velocity
+    expected = known.covariance + variance * np.outer(left, left)
+    np.testing.assert_allclose(without_turn, expected[9:15, 9:15], atol=1e-12)
