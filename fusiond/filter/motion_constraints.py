@@ -135,6 +135,14 @@ def constrain(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
+def roll(state: FilterState, params: Parameters) -> None:
+    """Apply the non-holonomic constraint while the inertial sensor, which shows standstill, is silent."""
+    _still, rolling = constraints_due(state, params)
+    if rolling and not rests(state, params):
+        _apply(state, NON_HOLONOMIC, params, 1.0)
+
+
+@compiled
 def constraints_due(state: FilterState, params: Parameters) -> tuple[bool, bool]:
     """Whether the vehicle stands, and whether its wheels keep it from going sideways, if it is time to look."""
     now = state.stamps[T]

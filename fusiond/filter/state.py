@@ -75,6 +75,9 @@ FIX_VARIANCE = _auxiliary.block(2)  # m^2, horizontal, vertical
 CONSTRAINT_RATIO = _auxiliary.block(3)  # last test ratios: non-holonomic, zero velocity, zero rotation
 RATE_VARIANCE = _auxiliary.one()  # (rad/s)^2, white noise of RATE_B, per axis
 SMOOTH_FORCE_B = _auxiliary.block(3)  # m/s^2, mean over the delays of receivers
+COASTING = _auxiliary.one()  # 1 while the state coasts: the gyro bias's errors are then those of the rate
+KEPT_BIAS_B = _auxiliary.block(3)  # rad/s, gyro bias from before that, and its covariance by rows
+KEPT_BIAS_COVARIANCE = _auxiliary.block(9)
 AUXILIARY_SIZE = _auxiliary.size
 
 # Remembered of each source: columns of FilterState.memory

@@ -15,7 +15,7 @@ import math
 
 from fusiond.filter import heading_bank, initial_alignment, source_health
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
-from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, watch
+from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, roll, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Outcome, Row, Rows
@@ -24,6 +24,7 @@ from fusiond.filter.state import (
     ATTITUDE,
     BLOWN,
     CHOOSING,
+    COASTING,
     EMPTY,
     FORCE_B,
     HELD_FORCE_B,
@@ -47,7 +48,7 @@ from fusiond.filter.state import (
     count_reset,
     is_finite,
 )
-from fusiond.filter.strapdown import COAST_RATE, COAST_TURN, coast, propagate
+from fusiond.filter.strapdown import COAST_SWAY, COAST_TURN, coast, end_coasting, propagate
 from fusiond.maths.portable import square
 from fusiond.maths.typed import Stamps, Vector, compiled
 
@@ -81,6 +82,8 @@ def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> N
             lost = variance > square(LOST_HEADING)
             if not (_fuse_while_lost(state, row, params, variance) if lost else fuse_measurement(state, row, params)):
                 row["outcome"] = Outcome.REJECTED
+            if coasted and not lost:
+                roll(state, params)
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
 
@@ -192,7 +195,7 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) 
     frozen = not source_health.is_trusted(state.memory[params.imu_source])
     if imu is None or held == NEVER or imu["t_ns"] - held > params.imu_gap_ns or frozen:
         coast(state, dt, params.noise, rests(state, params))
-        a[RATE_VARIANCE] = COAST_RATE * COAST_RATE
+        a[RATE_VARIANCE] = COAST_SWAY * COAST_SWAY
         return
     sample = imu["values"]
     span = float(imu["t_ns"] - held)
@@ -263,19 +266,25 @@ def keep_sample(state: FilterState, row: Row, params: Parameters) -> None:
     memory, own = state.memory[params.imu_source], state.source_stamps[params.imu_source]
     same = source_health.arrive(memory, own, row["values"], t_ns)
     source_health.judge_repetition(memory, own, same, t_ns)
+    if source_health.is_trusted(memory):
+        end_coasting(state)
     hold(state, row["values"], t_ns)
-    a[RATE_VARIANCE] = params.noise.gyro / max(dt, MIN_SPAN) if dt > 0 else 0.0
+    if a[COASTING] == 0.0:
+        a[RATE_VARIANCE] = params.noise.gyro / max(dt, MIN_SPAN) if dt > 0 else 0.0
     watch(state, a[HELD_FORCE_B], a[HELD_RATE_B], dt, params)
 
 
 @compiled
 def hold(state: FilterState, values: Vector, t_ns: int) -> None:
-    """Make an inertial sample the held one, at the state's instant."""
+    """Make an inertial sample the held one, at the state's instant. While the state coasts all the same, the angular rate is
+    not the sample's."""
     a = state.auxiliary
     state.stamps[T_IMU] = t_ns
     for i in range(3):
         a[HELD_FORCE_B.start + i] = a[FORCE_B.start + i] = values[i]
-        a[HELD_RATE_B.start + i] = a[RATE_B.start + i] = values[3 + i]
+        a[HELD_RATE_B.start + i] = values[3 + i]
+        if a[COASTING] == 0.0:
+            a[RATE_B.start + i] = values[3 + i]
 
 
 @compiled

@@ -1267,6 +1267,16 @@ cdef void motion_constraints_constrain(State* state, Parameters* params) noexcep
     elif rolling:
         motion_constraints__apply(state, 0, params, 1.0)
 
+cdef void motion_constraints_roll(State* state, Parameters* params) noexcept nogil:
+    cdef (bint, bint) _t1
+    cdef bint _still
+    cdef bint rolling
+    _t1 = motion_constraints_constraints_due(state, params)
+    _still = _t1[0]
+    rolling = _t1[1]
+    if (rolling and (not motion_constraints_rests(state, params))):
+        motion_constraints__apply(state, 0, params, 1.0)
+
 cdef (bint, bint) motion_constraints_constraints_due(State* state, Parameters* params) noexcept nogil:
     cdef int64_t now
     cdef bint still
@@ -2087,6 +2097,8 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
             lost = (variance > portable_square(0.20943951023931956))
             if (not (step__fuse_while_lost(state, row, params, variance) if lost else measurement_fuse_measurement(state, row, params))):
                 row.outcome = 1
+            if (coasted and (not lost)):
+                motion_constraints_roll(state, params)
         step_guard(state)
     state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
 
@@ -2180,7 +2192,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     frozen = (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE))
     if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > params.imu_gap_ns) or frozen):
         strapdown_coast(state, dt, &params.noise, motion_constraints_rests(state, params))
-        a[35] = (0.5 * 0.5)
+        a[35] = (0.05 * 0.05)
         return
     sample = imu.values
     span = (<double>((imu.t_ns - held)))
@@ -2286,24 +2298,26 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     own = state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE
     same = source_health_arrive(memory, own, row.values, t_ns)
     source_health_judge_repetition(memory, own, same, t_ns)
+    if source_health_is_trusted(memory):
+        strapdown_end_coasting(state)
     step_hold(state, row.values, t_ns)
-    a[35] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
+    if (a[39] == 0.0):
+        a[35] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
     cdef double* a
     cdef int64_t i
     cdef double _t1
-    cdef double _t2
     a = state.auxiliary
     state.stamps[1] = t_ns
     for i in range(3):
         _t1 = values[i]
         a[(0 + i)] = _t1
         a[(6 + i)] = _t1
-        _t2 = values[(3 + i)]
-        a[(3 + i)] = _t2
-        a[(9 + i)] = _t2
+        a[(3 + i)] = values[(3 + i)]
+        if (a[39] == 0.0):
+            a[(9 + i)] = values[(3 + i)]
 
 cdef void step_guard(State* state) noexcept nogil:
     cdef int64_t i
@@ -2647,6 +2661,15 @@ cdef void strapdown__add_noise(double* p, double dt, double accel, double gyro, 
         p[(i) * n + i] += (noise.calibrations[(i - 15)] * dt)
 
 cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noexcept nogil:
+    cdef double _t1
+    cdef int64_t parts
+    cdef int64_t _part
+    _t1 = ceil((dt / 0.05))
+    parts = (<int64_t>((_t1 if _t1 > 1.0 else 1.0)))
+    for _part in range(parts):
+        strapdown__coast(state, (dt / parts), noise, rests)
+
+cdef void strapdown__coast(State* state, double dt, Noise* noise, bint rests) noexcept nogil:
     cdef double* x
     cdef double* p
     cdef int _i
@@ -2681,6 +2704,11 @@ cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noe
     _t1 = sqrt((((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2])))
     for _i in range(3):
         up_e[_i] = (r[_i] / _t1)
+    if (state.stamps[9] == 2):
+        strapdown_begin_coasting(state)
+        strapdown__turn(state, dt, up_e)
+        linear_mirror(p)
+        return
     rotation_cross(up_e, x + 3, sideways_e)
     memset(turned, 0, n * sizeof(double))
     memset(displaced, 0, n * sizeof(double))
@@ -2700,3 +2728,170 @@ cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noe
         for _i in range(n):
             (p + (i) * n)[_i] += (((_t2 * turned[_i]) + (_t3 * displaced[_i])) + (second * ((_t4 * displaced[_i]) + (_t5 * turned[_i]))))
     linear_mirror(p)
+
+cdef void strapdown_begin_coasting(State* state) noexcept nogil:
+    cdef double* a
+    cdef double* p
+    cdef int64_t bias
+    cdef int _i
+    cdef int64_t i
+    cdef int64_t j
+    a = state.auxiliary
+    p = state.covariance
+    bias = 9
+    if (a[39] == 0.0):
+        a[39] = 1.0
+        for _i in range(3):
+            (a + 40)[_i] = (state.nominal + 10)[_i]
+        for i in range(3):
+            for j in range(3):
+                a[((43 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
+    for _i in range(3):
+        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 40)[_i])
+    for _i in range(3):
+        (state.nominal + 10)[_i] = (a + 40)[_i]
+    a[35] = (0.05 * 0.05)
+
+cdef void strapdown_end_coasting(State* state) noexcept nogil:
+    cdef double* a
+    cdef double* p
+    cdef int64_t bias
+    cdef int _i
+    cdef int64_t i
+    cdef int64_t j
+    a = state.auxiliary
+    p = state.covariance
+    bias = 9
+    if (a[39] == 0.0):
+        return
+    a[39] = 0.0
+    for _i in range(3):
+        (state.nominal + 10)[_i] = (a + 40)[_i]
+    for i in range(3):
+        for _i in range(n):
+            (p + ((bias + i)) * n)[_i] = 0.0
+        for _i in range(n):
+            (p + (bias + i))[_i * n] = 0.0
+    for i in range(3):
+        for j in range(3):
+            p[((bias + i)) * n + (bias + j)] = a[((43 + (3 * i)) + j)]
+
+cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef double* a
+    cdef int64_t bias
+    cdef double c[3 * 3]
+    cdef double rate_b[3]
+    cdef int _i
+    cdef double up_b[3]
+    cdef double speed
+    cdef double turn[4]
+    cdef double _t1
+    cdef double _t2[3]
+    cdef double mat[3 * 3]
+    cdef double _t3[3]
+    cdef double _t4[4]
+    cdef double _t5[4]
+    cdef double sideways_e[3]
+    cdef double rows[6 * n]
+    cdef double _t6
+    cdef double _t7
+    cdef double _t8
+    cdef double by_rate[n]
+    cdef int64_t i
+    cdef double along
+    cdef double across
+    cdef double _t9
+    cdef double _t10
+    cdef double _t11
+    cdef double _t12
+    cdef double _t13
+    cdef double _t14
+    cdef double columns[6 * n]
+    cdef double _t15
+    cdef double _t16
+    cdef double _t17
+    cdef double _t18
+    cdef double _t19
+    cdef double _t20
+    cdef double _t21
+    cdef double _t22
+    cdef double _t23
+    cdef double kept
+    cdef double fresh
+    cdef int64_t j
+    x = state.nominal
+    p = state.covariance
+    a = state.auxiliary
+    bias = 9
+    rotation_matrix(x + 6, c)
+    for _i in range(3):
+        rate_b[_i] = ((a + 9)[_i] - (x + 10)[_i])
+    rotation_transposed_times(c, up_e, up_b)
+    speed = (((up_b[0] * rate_b[0]) + (up_b[1] * rate_b[1])) + (up_b[2] * rate_b[2]))
+    _t1 = (speed * dt)
+    for _i in range(3):
+        _t2[_i] = (up_e[_i] * _t1)
+    rotation_quaternion_exp(_t2, turn)
+    rotation_matrix(turn, mat)
+    rotation_times(mat, x + 3, _t3)
+    for _i in range(3):
+        (x + 3)[_i] = _t3[_i]
+    rotation_quaternion_multiply(turn, x + 6, _t5)
+    rotation_normalised(_t5, _t4)
+    for _i in range(4):
+        (x + 6)[_i] = _t4[_i]
+    rotation_cross(up_e, x + 3, sideways_e)
+    _t6 = up_b[0]
+    _t7 = up_b[1]
+    _t8 = up_b[2]
+    for _i in range(n):
+        by_rate[_i] = (((_t6 * (p + (bias) * n)[_i]) + (_t7 * (p + ((bias + 1)) * n)[_i])) + (_t8 * (p + ((bias + 2)) * n)[_i]))
+    for i in range(3):
+        along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
+        _t9 = mat[(i) * 3 + 0]
+        _t10 = mat[(i) * 3 + 1]
+        _t11 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (rows + (i) * n)[_i] = ((((_t9 * (p + (3) * n)[_i]) + (_t10 * (p + (4) * n)[_i])) + (_t11 * (p + (5) * n)[_i])) + (along * by_rate[_i]))
+        _t12 = mat[(i) * 3 + 0]
+        _t13 = mat[(i) * 3 + 1]
+        _t14 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (rows + ((3 + i)) * n)[_i] = ((((_t12 * (p + (6) * n)[_i]) + (_t13 * (p + (7) * n)[_i])) + (_t14 * (p + (8) * n)[_i])) + (across * by_rate[_i]))
+    for i in range(6):
+        for _i in range(n):
+            (p + ((3 + i)) * n)[_i] = (rows + (i) * n)[_i]
+    _t15 = up_b[0]
+    _t16 = up_b[1]
+    _t17 = up_b[2]
+    for _i in range(n):
+        by_rate[_i] = (((_t15 * (p + bias)[_i * n]) + (_t16 * (p + (bias + 1))[_i * n])) + (_t17 * (p + (bias + 2))[_i * n]))
+    for i in range(3):
+        along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
+        _t18 = mat[(i) * 3 + 0]
+        _t19 = mat[(i) * 3 + 1]
+        _t20 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (columns + (i) * n)[_i] = ((((_t18 * (p + 3)[_i * n]) + (_t19 * (p + 4)[_i * n])) + (_t20 * (p + 5)[_i * n])) + (along * by_rate[_i]))
+        _t21 = mat[(i) * 3 + 0]
+        _t22 = mat[(i) * 3 + 1]
+        _t23 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (columns + ((3 + i)) * n)[_i] = ((((_t21 * (p + 6)[_i * n]) + (_t22 * (p + 7)[_i * n])) + (_t23 * (p + 8)[_i * n])) + (across * by_rate[_i]))
+    for i in range(6):
+        for _i in range(n):
+            (p + (3 + i))[_i * n] = (columns + (i) * n)[_i]
+    kept = portable_exp(((-dt) / 1.5))
+    for i in range(3):
+        for _i in range(n):
+            (p + ((bias + i)) * n)[_i] *= kept
+    for i in range(3):
+        for _i in range(n):
+            (p + (bias + i))[_i * n] *= kept
+    fresh = (portable_square(0.25) * (1 - (kept * kept)))
+    for i in range(3):
+        a[(9 + i)] = (x[(10 + i)] + ((speed * kept) * up_b[i]))
+        for j in range(3):
+            p[((bias + i)) * n + (bias + j)] += ((fresh * up_b[i]) * up_b[j])
