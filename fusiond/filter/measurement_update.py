@@ -146,20 +146,13 @@ def update_projected(
         share = detection(distance, m, clutter)
         if share < NEGLIGIBLE:
             return ratio, False
-    weighed, lower = np.empty((3, 3)), np.empty((3, 3))
     gain = np.empty((3, state.size))
-    for a in range(m):
-        gain[a] = across[a]
-        weighed[a] = spread[a]
-    if given:
-        give_scale(p, m, gain, weighed)
-    if not cholesky(weighed, seen.variance, factor, m, lower):
+    if not _make_gain(p, seen, factor, given, across, spread, gain):
         return ratio, False
     before = np.empty((state.size, state.size))
     if share < 1:
         for i in range(state.size):
             before[i] = p[i]
-    _solve(lower, m, gain)
     _joseph(p, seen, factor, across, gain)
     error = np.zeros(state.size)
     for a in range(m):
@@ -172,6 +165,29 @@ def update_projected(
     turn_along(p, error)
     inject(state, error)
     return ratio, share >= 0.5
+
+
+@compiled
+def _make_gain(
+    p: Covariance,
+    seen: Observation,
+    factor: float,
+    given: bool,
+    across: ErrorRows3,
+    spread: Matrix3,
+    gain: ErrorRows3,
+) -> bool:
+    """Write the gain's transpose K' (m, n) into `gain`; False where its S is not positive definite."""
+    weighed, lower = np.empty((3, 3)), np.empty((3, 3))
+    for a in range(seen.m):
+        gain[a] = across[a]
+        weighed[a] = spread[a]
+    if given:
+        give_scale(p, seen.m, gain, weighed)
+    if not cholesky(weighed, seen.variance, factor, seen.m, lower):
+        return False
+    _solve(lower, seen.m, gain)
+    return True
 
 
 @compiled
@@ -190,12 +206,13 @@ def _solve(lower: Matrix3, m: int, gain: ErrorRows3) -> None:
 @compiled
 def give_scale(p: Covariance, m: int, across: ErrorRows3, spread: Matrix3) -> None:
     """Make H P (m, n) and H P H' (m, m) those of P given the wheels' scale, P - P_s P_s' / P_ss. The gain of that is what a
-    filter would have that knew the scale: it leaves the scale alone, and what the scale's error does to the rest goes into
-    the covariance (a consider filter: Schmidt 1966).
+    filter would have that knew the scale: it leaves the scale alone, and what the scale's error does to the rest goes
+    into the covariance (a consider filter: Schmidt 1966).
 
-    Wheels, inertial sensor and constraints alone do not show how much too high wheels read. With the gain of the whole P they
-    seem to: the speed that multiplies the scale has the noise in it that the innovation has, and the product of the two is a
-    bias of scale and position, and knowledge that is none. GNSS shows it, by what the wheels have made of the velocity.
+    Wheels, inertial sensor and constraints alone do not show how much too high wheels read. With the gain of the whole P
+    they seem to: the speed that multiplies the scale has the noise in it that the innovation has, and the product of the
+    two is a bias of scale and position, and knowledge that is none. GNSS shows it, by what the
+    wheels have made of the velocity.
     Further scales are learnt against this one.
     """
     variance = p[SCALE.start, SCALE.start]

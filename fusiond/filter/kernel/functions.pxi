@@ -940,12 +940,10 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     cdef int64_t a
     cdef double ratio
     cdef double share
-    cdef double weighed[3 * 3]
-    cdef double lower[3 * 3]
     cdef double gain[3 * n]
-    cdef int _i
     cdef double before[n * n]
     cdef int64_t i
+    cdef int _i
     cdef double error[n]
     cdef double mixed
     cdef double _t1
@@ -967,20 +965,12 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
         share = measurement_update_detection(distance, m, clutter)
         if (share < 1e-06):
             return (ratio, False)
-    for a in range(m):
-        for _i in range(n):
-            (gain + (a) * n)[_i] = (across + (a) * n)[_i]
-        for _i in range(3):
-            (weighed + (a) * 3)[_i] = (spread + (a) * 3)[_i]
-    if given:
-        measurement_update_give_scale(p, m, gain, weighed)
-    if (not measurement_update_cholesky(weighed, seen.variance, factor, m, lower)):
+    if (not measurement_update__make_gain(p, seen, factor, given, across, spread, gain)):
         return (ratio, False)
     if (share < 1):
         for i in range(n):
             for _i in range(n):
                 (before + (i) * n)[_i] = (p + (i) * n)[_i]
-    measurement_update__solve(lower, m, gain)
     measurement_update__joseph(p, seen, factor, across, gain)
     memset(error, 0, n * sizeof(double))
     for a in range(m):
@@ -997,6 +987,23 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     measurement_update_turn_along(p, error)
     measurement_update_inject(state, error)
     return (ratio, (share >= 0.5))
+
+cdef bint measurement_update__make_gain(double* p, Observation* seen, double factor, bint given, double* across, double* spread, double* gain) noexcept nogil:
+    cdef double weighed[3 * 3]
+    cdef double lower[3 * 3]
+    cdef int64_t a
+    cdef int _i
+    for a in range(seen.m):
+        for _i in range(n):
+            (gain + (a) * n)[_i] = (across + (a) * n)[_i]
+        for _i in range(3):
+            (weighed + (a) * 3)[_i] = (spread + (a) * 3)[_i]
+    if given:
+        measurement_update_give_scale(p, seen.m, gain, weighed)
+    if (not measurement_update_cholesky(weighed, seen.variance, factor, seen.m, lower)):
+        return False
+    measurement_update__solve(lower, seen.m, gain)
+    return True
 
 cdef void measurement_update__solve(double* lower, int64_t m, double* gain) noexcept nogil:
     cdef int64_t i
