@@ -82,7 +82,7 @@ def correlation_of(model: int, values: Vector, parameter: Vector) -> float:
 
 
 @compiled
-def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
+def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0912, PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
     model, values = params.models[source], row["values"]
@@ -138,6 +138,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             state.stamps[T_POSITION] = t_ns
     elif stamps[T_REJECTED] == NEVER:
         stamps[T_REJECTED] = t_ns
+    if model == WHEEL_SPEED and not fused:
+        source_health.note_rejected(memory, values[wheel_speed.SPEED], seen.innovation[0])
     return fused
 
 

@@ -94,6 +94,8 @@ LAST_SUM = _memory.one()  # of the last reading's numbers: shows a repeated one
 INTERVAL = _memory.one()  # s, mean spacing of the events
 LAST_INNOVATION = _memory.block(3)  # of the last rejection
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
+REJECTED_SPEED = _memory.one()  # m/s, mean of a wheel's readings that were rejected in motion
+ACTUAL_SPEED = _memory.one()  # m/s, what they should have been, mean; 0 before the first
 MEMORY_SIZE = _memory.size
 
 # Stamps and counts: places in FilterState.stamps

@@ -755,6 +755,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
             state.stamps[4] = t_ns
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
+    if ((model == 2) and (not fused)):
+        source_health_note_rejected(memory, values[0], seen.innovation[0])
     return fused
 
 cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Parameters* params) noexcept nogil:
@@ -2046,6 +2048,16 @@ cdef bint source_health_arrive(double* memory, int64_t* stamps, double* values, 
         share = (0.05 if (memory[13] > 0) else 1.0)
         memory[13] += (share * ((10.0 if 10.0 < elapsed else elapsed) - memory[13]))
     return same
+
+cdef void source_health_note_rejected(double* memory, double reading, double innovation) noexcept nogil:
+    cdef double expected
+    cdef double share
+    expected = fabs((reading - innovation))
+    if (expected < 2.0):
+        return
+    share = (0.02 if (memory[19] > 0) else 1.0)
+    memory[18] += (share * (fabs(reading) - memory[18]))
+    memory[19] += (share * (expected - memory[19]))
 
 cdef bint source_health_moved(double* memory, double* innovation, double* variance, int64_t m, double gate) noexcept nogil:
     cdef double total
