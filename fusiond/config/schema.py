@@ -71,7 +71,7 @@ class Motion(Section, frozen=True, kw_only=True):
     lateral_sigma_mps: Positive = 0.2  # sigma of the sideways speed: slip
     vertical_sigma_mps: Positive = 0.3  # sigma of the vertical speed: suspension
     interval_s: Seconds = 0.1  # spacing of constraint, zero velocity and zero rotation updates
-    minimum_speed_mps: NotNegative = 1.0  # the non-holonomic constraint is not used below this speed
+    minimum_speed_mps: NotNegative = 0.3  # the non-holonomic constraint is not used below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
     still_wheel_mps: Positive = 0.1  # every wheel at or below this speed, at which it may creep unseen
     still_gyro_deg_s: Positive = 0.6  # standard deviation of the gyro below this

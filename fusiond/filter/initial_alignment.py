@@ -84,6 +84,7 @@ from fusiond.filter.state import (
     T,
 )
 from fusiond.filter.stored_state import StoredState
+from fusiond.filter.strapdown import end_coasting
 from fusiond.maths.portable import atan2, sin_cos, square
 from fusiond.maths.rotation import matrix, matrix_from_euler, product, quaternion
 from fusiond.maths.typed import Array, compiled
@@ -102,6 +103,7 @@ COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a ca
 
 def begin(state: FilterState) -> None:
     """Forget everything but the biases and calibrations, and start to align."""
+    end_coasting(state)
     for stamp in (T, T_IMU, T_CONSTRAINT, T_STILL, T_FIRST_VELOCITY, T_FIX, T_REST, T_START, T_POSITION, T_GNSS_ERROR):
         state.stamps[stamp] = NEVER
     state.stamps[PHASE] = ALIGNING

@@ -149,7 +149,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         seen.variance[a] = learnt[a] * noisy
     heard = not doubtful and not source_health.is_stuck(memory) and (trusted or by_rivals)
     fits = rivals.likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0
-    ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
+    gate, clutter, scaled = params.gates[m], parameter[CLUTTER], model == WHEEL_SPEED
+    ratio, fused = update_projected(state, seen, gate, weight, trusted, clutter, across, spread, scaled)
     row["ratio"] = memory[LAST_RATIO] = ratio
     best = 0.0
     if state.stamps[ALIVE] > 0 and heard and fits > 0:
@@ -186,6 +187,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             state.auxiliary[STATE_DOUBT] = 0.0
     elif stamps[T_REJECTED] == NEVER:
         stamps[T_REJECTED] = t_ns
+    if model == WHEEL_SPEED and not fused:
+        source_health.note_rejected(memory, values[wheel_speed.SPEED], seen.innovation[0])
     return fused
 
 
@@ -256,7 +259,7 @@ def _fuse_rivals(
             if slot == rivals.INERTIAL:
                 own = rivals.fit_lie(rival, seen, weight, across, spread, own)
             ratio, _fused = update_projected(
-                rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread
+                rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread, model == WHEEL_SPEED
             )
             if slot == rivals.INERTIAL and ratio <= 1:
                 own = max(own, gained * main)

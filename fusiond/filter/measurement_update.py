@@ -17,6 +17,7 @@ from fusiond.filter.state import (
     POSITION,
     POSITION_E,
     QUATERNION_EB,
+    SCALE,
     VELOCITY,
     VELOCITY_E,
     FilterState,
@@ -94,18 +95,25 @@ def whiten(spread: Matrix3, innovation: Vector3, variance: Vector3, m: int, whit
 
 @compiled
 def update(
-    state: FilterState, seen: Observation, gate: float, factor: float = 1.0, trusted: bool = True, clutter: float = 0.0
+    state: FilterState,
+    seen: Observation,
+    gate: float,
+    factor: float = 1.0,
+    trusted: bool = True,
+    clutter: float = 0.0,
+    given: bool = False,
 ) -> tuple[float, bool]:
     """Fuse an observation unless its test ratio d' S^-1 d / gate exceeds 1, or it is not trusted. Returns the ratio
     (infinite where S is not positive definite, a variance negative or anything not finite) and whether it was fused.
 
     It is judged by its own variance, and weighed by `factor` times that: a sample whose error it shares with the ones
     before is worth little, but is no less wrong when it is far off. With `clutter`, the share of readings that are anywhere,
-    there is no gate: see `detection`.
+    there is no gate: see `detection`. With `given`, the
+    wheels' scale is taken as it is: see `give_scale`.
     """
     across, spread = np.empty((3, state.size)), np.empty((3, 3))
     project(state, seen, across, spread)
-    return update_projected(state, seen, gate, factor, trusted, clutter, across, spread)
+    return update_projected(state, seen, gate, factor, trusted, clutter, across, spread, given)
 
 
 @compiled
@@ -118,6 +126,7 @@ def update_projected(
     clutter: float,
     across: ErrorRows3,
     spread: Matrix3,
+    given: bool = False,
 ) -> tuple[float, bool]:
     """`update` of an observation that was projected: H P (m, n) and H P H' (m, m)."""
     m, p = seen.m, state.covariance
@@ -137,15 +146,13 @@ def update_projected(
         share = detection(distance, m, clutter)
         if share < NEGLIGIBLE:
             return ratio, False
-    lower = np.empty((3, 3))
-    if not cholesky(spread, seen.variance, factor, m, lower):
+    gain = np.empty((3, state.size))
+    if not _make_gain(p, seen, factor, given, across, spread, gain):
         return ratio, False
     before = np.empty((state.size, state.size))
     if share < 1:
         for i in range(state.size):
             before[i] = p[i]
-    gain = np.empty((3, state.size))
-    _solve(lower, across, m, gain)
     _joseph(p, seen, factor, across, gain)
     error = np.zeros(state.size)
     for a in range(m):
@@ -161,10 +168,32 @@ def update_projected(
 
 
 @compiled
-def _solve(lower: Matrix3, across: ErrorRows3, m: int, gain: ErrorRows3) -> None:
-    """The gain's transpose K' = S^-1 (P H')' (m, n), with S = lower lower'."""
+def _make_gain(
+    p: Covariance,
+    seen: Observation,
+    factor: float,
+    given: bool,
+    across: ErrorRows3,
+    spread: Matrix3,
+    gain: ErrorRows3,
+) -> bool:
+    """Write the gain's transpose K' (m, n) into `gain`; False where its S is not positive definite."""
+    weighed, lower = np.empty((3, 3)), np.empty((3, 3))
+    for a in range(seen.m):
+        gain[a] = across[a]
+        weighed[a] = spread[a]
+    if given:
+        give_scale(p, seen.m, gain, weighed)
+    if not cholesky(weighed, seen.variance, factor, seen.m, lower):
+        return False
+    _solve(lower, seen.m, gain)
+    return True
+
+
+@compiled
+def _solve(lower: Matrix3, m: int, gain: ErrorRows3) -> None:
+    """Make H P (m, n) the gain's transpose K' = S^-1 (P H')', with S = lower lower'."""
     for i in range(m):
-        gain[i] = across[i]
         for k in range(i):
             gain[i] += -lower[i, k] * gain[k]
         gain[i] /= lower[i, i]
@@ -172,6 +201,31 @@ def _solve(lower: Matrix3, across: ErrorRows3, m: int, gain: ErrorRows3) -> None
         for k in range(i + 1, m):
             gain[i] += -lower[k, i] * gain[k]
         gain[i] /= lower[i, i]
+
+
+@compiled
+def give_scale(p: Covariance, m: int, across: ErrorRows3, spread: Matrix3) -> None:
+    """Make H P (m, n) and H P H' (m, m) those of P given the wheels' scale, P - P_s P_s' / P_ss. The gain of that is what a
+    filter would have that knew the scale: it leaves the scale alone, and what the scale's error does to the rest goes
+    into the covariance (a consider filter: Schmidt 1966).
+
+    Wheels, inertial sensor and constraints alone do not show how much too high wheels read. With the gain of the whole P
+    they seem to: the speed that multiplies the scale has the noise in it that the innovation has, and the product of the
+    two is a bias of scale and position, and knowledge that is none. GNSS shows it, by what the
+    wheels have made of the velocity.
+    Further scales are learnt against this one.
+    """
+    variance = p[SCALE.start, SCALE.start]
+    if not variance > 0:
+        return
+    by = np.empty(3)
+    for a in range(m):
+        by[a] = across[a, SCALE.start]
+    for a in range(m):
+        across[a] += (-by[a] / variance) * p[SCALE.start]
+        across[a, SCALE.start] = 0.0
+        for i in range(m):
+            spread[a, i] -= by[a] * by[i] / variance
 
 
 @compiled

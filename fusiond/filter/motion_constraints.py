@@ -139,6 +139,14 @@ def constrain(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
+def roll(state: FilterState, params: Parameters) -> None:
+    """Apply the non-holonomic constraint while the inertial sensor, which shows standstill, is silent."""
+    _still, rolling = constraints_due(state, params)
+    if rolling and not rests(state, params):
+        _apply(state, NON_HOLONOMIC, params, 1.0)
+
+
+@compiled
 def constraints_due(state: FilterState, params: Parameters) -> tuple[bool, bool]:
     """Whether the vehicle stands, and whether its wheels keep it from going sideways, if it is time to look."""
     now = state.stamps[T]
@@ -169,7 +177,7 @@ def _apply(state: FilterState, which: int, params: Parameters, factor: float) ->
     across, spread = np.empty((3, state.size)), np.empty((3, 3))
     project(state, seen, across, spread)
     fits = rivals.likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
-    ratio, fused = update_projected(state, seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+    ratio, fused = update_projected(state, seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
     if state.stamps[ALIVE] > 0:
         _apply_to_rivals(state, which, params, factor, fits)
     rivals.watch_inertial(state, seen, factor, spread, fits)
@@ -194,5 +202,5 @@ def _apply_to_rivals(state: FilterState, which: int, params: Parameters, factor:
                 project(rival, seen, across, spread)
                 own = rivals.likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
                 rivals.weigh(state, slot, own, fits)
-                update_projected(rival, seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+                update_projected(rival, seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
     rivals.decide(state, params)

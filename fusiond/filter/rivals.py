@@ -25,6 +25,7 @@ from fusiond.filter.state import (
     ACCEL_BIAS,
     ALIVE,
     ATTITUDE,
+    COASTING,
     EXCLUDED,
     GYRO_BIAS,
     INERTIAL_DOUBT,
@@ -142,6 +143,9 @@ def watch_inertial(state: FilterState, seen: Observation, factor: float, spread:
 @compiled
 def suspect_motion(state: FilterState, odds: float) -> None:
     """Begin the rivals in which the inertial sensor lied, and in which all wheels do, where they are not there yet."""
+    state.auxiliary[INERTIAL_ODDS] = LEAST_ODDS
+    if state.auxiliary[COASTING] != 0:
+        return
     if state.bank[INERTIAL, 0] == 0:
         open_slot(state, INERTIAL, odds)
         rival = state.hypothesis(INERTIAL)
@@ -150,7 +154,6 @@ def suspect_motion(state: FilterState, odds: float) -> None:
             rival.covariance[k, k] += FIRST * lie_variance(k)
     if state.bank[WHEELS, 0] == 0:
         open_slot(state, WHEELS, odds)
-    state.auxiliary[INERTIAL_ODDS] = LEAST_ODDS
 
 
 @compiled
@@ -218,7 +221,9 @@ def wheels_contradict(state: FilterState, params: Parameters) -> bool:
 
 @compiled
 def open_slot(state: FilterState, slot: int, odds: float) -> None:
-    """Begin a rival as a copy of the main state, with odds against that."""
+    """Begin a rival as a copy of the main state, with odds against that; but not while the state coasts."""
+    if state.auxiliary[COASTING] != 0:
+        return
     if state.stamps[ALIVE] == 0:
         state.auxiliary[MAIN_WEIGHT] = 1.0
     if state.bank[slot, 0] == 0:
@@ -236,6 +241,13 @@ def close_slot(state: FilterState, slot: int) -> None:
     if state.bank[slot, 0] > 0:
         state.stamps[ALIVE] -= 1
     state.bank[slot] = 0.0
+
+
+@compiled
+def close_all(state: FilterState) -> None:
+    """Give all rivals up."""
+    for slot in range(RIVALS):
+        close_slot(state, slot)
 
 
 @compiled

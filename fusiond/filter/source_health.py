@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.filter.state import (
+    ACTUAL_SPEED,
     BEFORE,
     BELIEF,
     BIAS,
@@ -31,6 +32,7 @@ from fusiond.filter.state import (
     NOISE_EXCESS,
     NOISY,
     NOMINAL,
+    REJECTED_SPEED,
     T_JUDGED,
     T_LAST,
 )
@@ -62,6 +64,10 @@ NOISE_TIME = 30.0  # s, over which noise is learnt
 CLIPPED = 25.0  # a squared innovation counts for at most so many times its variance: outliers are not noise
 MAX_INTERVAL = 10.0  # s: a longer pause counts as this in the mean spacing
 INTERVAL_SHARE = 0.05  # weight of the newest interval in the mean
+MOVING = 2.0  # m/s: from here on a rejected wheel is compared with the vehicle's speed
+REJECTED_SHARE = 0.02  # weight of the newest rejected reading in their mean
+UNITS = {"km/h": 3.6, "mph": 1 / 0.44704, "knots": 1 / 0.514444, "m/s": 1 / 3.6}  # times too high, if it is that unit
+UNIT_SHARE = 0.06  # how far from that a wheel may be
 NIS_TIME = 10.0  # s, over which the mean of the normalised innovation squared is taken
 
 
@@ -297,6 +303,30 @@ def arrive(memory: Vector, stamps: Stamps, values: Vector, t_ns: int) -> bool:
     return same
 
 
+@compiled
+def note_rejected(memory: Vector, reading: float, innovation: float) -> None:
+    """Keep what a wheel reads [m/s] that is rejected in motion, and what it should have read."""
+    expected = abs(reading - innovation)
+    if expected < MOVING:
+        return
+    share = REJECTED_SHARE if memory[ACTUAL_SPEED] > 0 else 1.0
+    memory[REJECTED_SPEED] += share * (abs(reading) - memory[REJECTED_SPEED])
+    memory[ACTUAL_SPEED] += share * (expected - memory[ACTUAL_SPEED])
+
+
+def misreading(memory: Array) -> str:
+    """What a wheel that is rejected reads, for people; nothing where none was rejected in motion."""
+    if memory[ACTUAL_SPEED] <= 0:
+        return ""
+    ratio = float(memory[REJECTED_SPEED] / memory[ACTUAL_SPEED])
+    if ratio < 0.02:
+        return "it reads 0 while the vehicle moves"
+    for unit, factor in UNITS.items():
+        if abs(ratio / factor - 1) < UNIT_SHARE:
+            return f"it reads {ratio:.2f} times the vehicle's speed: is the unit {unit}?"
+    return f"it reads {ratio:.2f} times the vehicle's speed"
+
+
 def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int) -> Belief:
     """The health of a source at `t_ns`, where the filter has run since `since_ns`.
 
@@ -322,6 +352,8 @@ def _reason(memory: Array, status: str, age: float) -> str:
     match status:
         case "noisy":
             return f"squared innovations {memory[MEAN_NIS]:.1f} times as large as expected"
+        case "biased" | "frozen" if found := misreading(memory):
+            return f"{found}; not fused"
         case "biased":
             off = max(memory[BIAS].tolist(), key=abs)
             return f"constant error of {abs(off):.0f} sigma; not fused"

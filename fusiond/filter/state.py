@@ -89,6 +89,9 @@ QUANTUM = _auxiliary.block(2)  # m/s^2, rad/s: the least change that was seen
 PEAK = _auxiliary.block(2)  # m/s^2, rad/s: the largest reading
 FROZEN_ODDS = _auxiliary.block(6)  # that an axis is frozen
 SHARE_CHANGED = _auxiliary.block(6)  # share of the samples in which an axis changes while the two others of its kind do
+COASTING = _auxiliary.one()  # 1 while the state coasts: the gyro bias's errors are then those of the rate
+KEPT_BIAS_B = _auxiliary.block(3)  # rad/s, gyro bias from before that, and its covariance by rows
+KEPT_BIAS_COVARIANCE = _auxiliary.block(9)
 AUXILIARY_SIZE = _auxiliary.size
 
 # Remembered of each source: columns of FilterState.memory
@@ -108,6 +111,8 @@ EXCLUDED = _memory.one()  # 1: a receiver that was found to lie
 MEAN_NIS = _memory.one()  # normalised innovation squared per axis, mean
 FROZEN_PLACE = _memory.one()  # which axis of an inertial sensor is frozen (source_health.INERTIAL_AXES); 0: none
 FIX_TYPE = _memory.one()  # of a receiver's last fix; 0 before the first
+REJECTED_SPEED = _memory.one()  # m/s, mean of a wheel's readings that were rejected in motion
+ACTUAL_SPEED = _memory.one()  # m/s, what they should have been, mean; 0 before the first
 MEMORY_SIZE = _memory.size
 
 # Stamps and counts: places in FilterState.stamps

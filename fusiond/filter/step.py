@@ -15,10 +15,10 @@ import math
 
 from fusiond.filter import gnss_error, heading_bank, inertial_sample, initial_alignment, source_health
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
-from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, watch
+from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, roll, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.rivals import RIVALS, mix
+from fusiond.filter.rivals import RIVALS, close_all, mix
 from fusiond.filter.rows import Outcome, Row, Rows
 from fusiond.filter.state import (
     ALIGNING,
@@ -26,6 +26,7 @@ from fusiond.filter.state import (
     ATTITUDE,
     BLOWN,
     CHOOSING,
+    COASTING,
     EMPTY,
     FORCE_B,
     HELD_FORCE_B,
@@ -49,7 +50,7 @@ from fusiond.filter.state import (
     count_reset,
     is_finite,
 )
-from fusiond.filter.strapdown import COAST_RATE, COAST_TURN, add_white_noise, coast, propagate
+from fusiond.filter.strapdown import COAST_SWAY, COAST_TURN, add_white_noise, coast, end_coasting, propagate
 from fusiond.maths.portable import square
 from fusiond.maths.typed import Stamps, Vector, compiled
 
@@ -82,6 +83,8 @@ def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> N
             lost = variance > square(LOST_HEADING)
             if not (_fuse_while_lost(state, row, params, variance) if lost else fuse_measurement(state, row, params)):
                 row["outcome"] = Outcome.REJECTED
+            if coasted and not lost:
+                roll(state, params)
         guard(state)
     state.source_stamps[source, T_LAST] = t_ns
 
@@ -188,6 +191,8 @@ def advance_all(state: FilterState, t_ns: int, imu: Row | None, params: Paramete
     """Carry the state and its rivals to `t_ns`."""
     begin = int(state.stamps[T])
     advance(state, t_ns, imu, params)
+    if state.stamps[ALIVE] > 0 and state.auxiliary[COASTING] != 0:
+        close_all(state)  # they share one angular rate, which is estimated now
     if state.stamps[ALIVE] > 0:
         for slot in range(RIVALS):
             if state.bank[slot, 0] > 0:
@@ -209,7 +214,7 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) 
     frozen = not source_health.is_trusted(state.memory[params.imu_source])
     if imu is None or held == NEVER or imu["t_ns"] - held > params.imu_gap_ns or frozen:
         coast(state, dt, params.noise, rests(state, params))
-        a[RATE_VARIANCE] = COAST_RATE * COAST_RATE
+        a[RATE_VARIANCE] = COAST_SWAY * COAST_SWAY
         return
     sample, until = imu["values"], int(imu["t_ns"])
     believed = inertial_sample.is_believed(state, sample, until, params)
@@ -311,6 +316,7 @@ def keep_sample(state: FilterState, row: Row, params: Parameters) -> None:
     if not (believed and trusted and source_health.is_trusted(memory)):
         row["outcome"] = Outcome.REJECTED
         return
+    end_coasting(state)
     hold(state, row["values"], t_ns)
     a[RATE_VARIANCE] = params.noise.gyro / max(dt, inertial_sample.MIN_SPAN) if dt > 0 else 0.0
     watch(state, a[HELD_FORCE_B], a[HELD_RATE_B], dt, params)
@@ -318,12 +324,15 @@ def keep_sample(state: FilterState, row: Row, params: Parameters) -> None:
 
 @compiled
 def hold(state: FilterState, values: Vector, t_ns: int) -> None:
-    """Make an inertial sample the held one, at the state's instant."""
+    """Make an inertial sample the held one, at the state's instant. While the state coasts all the same, the angular rate is
+    not the sample's."""
     a = state.auxiliary
     state.stamps[T_IMU] = t_ns
     for i in range(3):
         a[HELD_FORCE_B.start + i] = a[FORCE_B.start + i] = values[i]
-        a[HELD_RATE_B.start + i] = a[RATE_B.start + i] = values[3 + i]
+        a[HELD_RATE_B.start + i] = values[3 + i]
+        if a[COASTING] == 0.0:
+            a[RATE_B.start + i] = values[3 + i]
 
 
 @compiled

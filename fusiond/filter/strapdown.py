@@ -17,19 +17,26 @@ from fusiond.filter.state import (
     ACCEL_BIAS_B,
     ATTITUDE,
     CALIBRATIONS,
+    COASTING,
     GYRO_BIAS,
     GYRO_BIAS_B,
     INERTIAL_DOUBT,
+    KEPT_BIAS_B,
+    KEPT_BIAS_COVARIANCE,
+    PHASE,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
+    RATE_B,
+    RATE_VARIANCE,
+    RUNNING,
     VELOCITY,
     VELOCITY_E,
     FilterState,
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
-from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, times
+from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, times, transposed_times
 from fusiond.maths.typed import Covariance, Matrix3, Vector3, compiled
 from fusiond.maths.wgs84 import EARTH_RATE, MU, gravity_e
 
@@ -40,7 +47,9 @@ DOUBT_TIME = 1.0  # s, over which the doubt in an inertial sensor that lied fade
 DOUBT_ACCEL = 0.01  # (m/s^2)^2/Hz that it adds to the noise while it is full: of the specific force
 DOUBT_GYRO = 1e-4  # (rad/s)^2/Hz: of the angular rate
 DOUBT_BIAS = 1e-4  # (rad/s)^2/s: of the gyro bias
-COAST_RATE = 0.5  # rad/s: the angular rate is not known any better then
+COAST_SWAY = 0.05  # rad/s, of roll and pitch: the angular rate is not known any better then
+TURN_RATE = 0.25  # rad/s, rms: how fast a vehicle turns about the vertical while only its wheels tell
+TURN_TIME = 1.5  # s, over which it keeps that rate
 MAX_STEP = 0.05  # s: longer intervals are propagated in equal parts
 CORNER = slice(0, 9)  # position, velocity, attitude: the error states that the transition changes
 
@@ -194,7 +203,17 @@ def add_white_noise(p: Covariance, dt: float, accel: float, gyro: float) -> None
 def coast(state: FilterState, dt: float, noise: ProcessNoise, rests: bool = False) -> None:
     """Carry the state `dt` [s] forward without inertial samples: constant velocity and attitude over the ground, with the
     uncertainty of a vehicle that may do otherwise; one that rests neither speeds up nor turns. When it turns, its velocity
-    turns along: wheels and body stay in line, whatever the heading."""
+    turns along: wheels and body stay in line, whatever the heading.
+
+    A running filter turns it by the rate about the vertical that wheels and receivers tell meanwhile: see `begin_coasting`.
+    Hypotheses of a heading share one angular rate, so they are taken to keep their heading, with the noise of a turn."""
+    parts = int(max(1.0, math.ceil(dt / MAX_STEP)))
+    for _part in range(parts):
+        _coast(state, dt / parts, noise, rests)
+
+
+@compiled
+def _coast(state: FilterState, dt: float, noise: ProcessNoise, rests: bool) -> None:
     x, p = state.nominal, state.covariance
     x[POSITION_E] += x[VELOCITY_E] * dt
     for i in range(3):
@@ -207,6 +226,11 @@ def coast(state: FilterState, dt: float, noise: ProcessNoise, rests: bool = Fals
         return
     r = x[POSITION_E]
     up_e = r / math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+    if state.stamps[PHASE] == RUNNING:
+        begin_coasting(state)
+        _turn(state, dt, up_e)
+        mirror(p)
+        return
     sideways_e = cross(up_e, x[VELOCITY_E])
     turned, displaced = np.zeros(len(p)), np.zeros(len(p))  # what a turn changes at once, and what it does from then on
     turned[ATTITUDE], turned[VELOCITY], displaced[POSITION] = up_e, sideways_e, sideways_e
@@ -219,3 +243,78 @@ def coast(state: FilterState, dt: float, noise: ProcessNoise, rests: bool = Fals
             + second * (turned[i] * displaced + displaced[i] * turned)
         )
     mirror(p)
+
+
+@compiled
+def begin_coasting(state: FilterState) -> None:
+    """Make the angular rate a quantity that is estimated: the states of the gyro bias stand for its error meanwhile, of
+    which every model knows what it does. The bias is kept."""
+    a, p, bias = state.auxiliary, state.covariance, GYRO_BIAS.start
+    if a[COASTING] == 0.0:
+        a[COASTING] = 1.0
+        a[KEPT_BIAS_B] = state.nominal[GYRO_BIAS_B]
+        for i in range(3):
+            for j in range(3):
+                a[KEPT_BIAS_COVARIANCE.start + 3 * i + j] = p[bias + i, bias + j]
+    a[RATE_B] -= state.nominal[GYRO_BIAS_B] - a[KEPT_BIAS_B]
+    state.nominal[GYRO_BIAS_B] = a[KEPT_BIAS_B]
+    a[RATE_VARIANCE] = COAST_SWAY * COAST_SWAY
+
+
+@compiled
+def end_coasting(state: FilterState) -> None:
+    """Make the states of the gyro bias that bias again, as it was kept; what correlates with the rate says nothing of it."""
+    a, p, bias = state.auxiliary, state.covariance, GYRO_BIAS.start
+    if a[COASTING] == 0.0:
+        return
+    a[COASTING] = 0.0
+    state.nominal[GYRO_BIAS_B] = a[KEPT_BIAS_B]
+    for i in range(3):
+        p[bias + i] = 0.0
+        p[:, bias + i] = 0.0
+    for i in range(3):
+        for j in range(3):
+            p[bias + i, bias + j] = a[KEPT_BIAS_COVARIANCE.start + 3 * i + j]
+
+
+@compiled
+def _turn(state: FilterState, dt: float, up_e: Vector3) -> None:
+    """Turn attitude and velocity about the vertical by the rate that is estimated, and let that fade: a first-order
+    Gauss-Markov process. Roll and pitch do not turn."""
+    x, p, a = state.nominal, state.covariance, state.auxiliary
+    bias = GYRO_BIAS.start
+    c = matrix(x[QUATERNION_EB])
+    rate_b = a[RATE_B] - x[GYRO_BIAS_B]
+    up_b = transposed_times(c, up_e)
+    speed = up_b[0] * rate_b[0] + up_b[1] * rate_b[1] + up_b[2] * rate_b[2]
+    turn = quaternion_exp(up_e * (speed * dt))
+    mat = matrix(turn)
+    x[VELOCITY_E] = times(mat, x[VELOCITY_E])
+    x[QUATERNION_EB] = normalised(quaternion_multiply(turn, x[QUATERNION_EB]))
+    sideways_e = cross(up_e, x[VELOCITY_E])
+    rows = np.empty((6, len(p)))
+    by_rate = up_b[0] * p[bias] + up_b[1] * p[bias + 1] + up_b[2] * p[bias + 2]
+    for i in range(3):
+        along, across = -dt * sideways_e[i], -dt * up_e[i]
+        rows[i] = mat[i, 0] * p[3] + mat[i, 1] * p[4] + mat[i, 2] * p[5] + along * by_rate
+        rows[3 + i] = mat[i, 0] * p[6] + mat[i, 1] * p[7] + mat[i, 2] * p[8] + across * by_rate
+    for i in range(6):
+        p[3 + i] = rows[i]
+    columns = np.empty((6, len(p)))
+    by_rate = up_b[0] * p[:, bias] + up_b[1] * p[:, bias + 1] + up_b[2] * p[:, bias + 2]
+    for i in range(3):
+        along, across = -dt * sideways_e[i], -dt * up_e[i]
+        columns[i] = mat[i, 0] * p[:, 3] + mat[i, 1] * p[:, 4] + mat[i, 2] * p[:, 5] + along * by_rate
+        columns[3 + i] = mat[i, 0] * p[:, 6] + mat[i, 1] * p[:, 7] + mat[i, 2] * p[:, 8] + across * by_rate
+    for i in range(6):
+        p[:, 3 + i] = columns[i]
+    kept = exp(-dt / TURN_TIME)
+    for i in range(3):
+        p[bias + i] *= kept
+    for i in range(3):
+        p[:, bias + i] *= kept
+    fresh = square(TURN_RATE) * (1 - kept * kept)
+    for i in range(3):
+        a[RATE_B.start + i] = x[GYRO_BIAS_B.start + i] + speed * kept * up_b[i]
+        for j in range(3):
+            p[bias + i, bias + j] += fresh * up_b[i] * up_b[j]

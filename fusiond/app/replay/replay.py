@@ -6,7 +6,7 @@ A tick is a publication, see `fusiond.engine`: it has the messages that the live
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fusiond import __version__
@@ -27,6 +27,7 @@ from fusiond.engine import Engine
 from fusiond.estimator.fusion import Receipt
 from fusiond.events import ClockPair, Received
 from fusiond.filter.rows import Outcome
+from fusiond.filter.source_health import misreading
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages import Message, StateMessage
 from fusiond.messages.schedule import IoHealth
@@ -164,6 +165,18 @@ class Replay:
     def _sources(self) -> dict[str, SourceReport]:
         outcomes, fusion = self.fusion.outcomes(), self.fusion
         return {
-            name: source_report(self._withheld[name], outcomes[name], fusion.invalid[name], self._latencies[name].report())
+            name: source_report(
+                self._withheld[name],
+                outcomes[name],
+                fusion.invalid[name],
+                self._latencies[name].report(),
+                self._remark(name, outcomes[name]),
+            )
             for name in self.config.sources()
         }
+
+    def _remark(self, name: str, outcomes: Mapping[str, int]) -> str:
+        """What is wrong with a wheel most of whose readings were rejected."""
+        if outcomes[Outcome.REJECTED.name] <= outcomes[Outcome.FUSED.name]:
+            return ""
+        return misreading(self.fusion.history.head.memory[self.fusion.history.index[name]])

@@ -45,6 +45,7 @@ class SourceReport(Struct, frozen=True, kw_only=True):
     withheld: int
     invalid_reasons: dict[str, int]
     latency_ms: Latency | None  # None if no event was usable
+    remark: str = ""  # what is wrong with a wheel most of whose readings were rejected
 
 
 class Span(Struct, frozen=True, kw_only=True):
@@ -189,7 +190,7 @@ class DeadReckoningLog:
 
 
 def source_report(
-    withheld: int, outcomes: Mapping[str, int], reasons: Mapping[str, int], latency: Latency | None
+    withheld: int, outcomes: Mapping[str, int], reasons: Mapping[str, int], latency: Latency | None, remark: str = ""
 ) -> SourceReport:
     """`outcomes`: counts by Outcome's names."""
     counts = {name.lower(): count for name, count in outcomes.items()}
@@ -198,6 +199,7 @@ def source_report(
         withheld=withheld,
         invalid_reasons=dict(sorted(reasons.items())),
         latency_ms=latency,
+        remark=remark,
         **counts,
     )
 
@@ -256,6 +258,8 @@ def _remarks(summary: Summary) -> Iterator[str]:
         if source.invalid_reasons:
             reasons = ", ".join(f"{reason} ({count})" for reason, count in source.invalid_reasons.items())
             yield f"  invalid of {name}: {reasons}"
+        if source.remark:
+            yield f"  {name} is of no use: {source.remark}"
         if source.too_old:
             yield f"  {name}: {source.too_old} came later than filter.horizon_s allows; a longer horizon would use them"
     if summary.rerun:

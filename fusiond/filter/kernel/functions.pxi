@@ -576,7 +576,7 @@ cdef void heading_bank_fuse(State* state, int64_t i, State* hypothesis, Observat
     measurement_update_project(hypothesis, seen, across, spread)
     if weighed:
         heading_bank_weigh(state, i, seen, factor, spread)
-    measurement_update_update_projected(hypothesis, seen, params.gates[seen.m], factor, True, 0.01, across, spread)
+    measurement_update_update_projected(hypothesis, seen, params.gates[seen.m], factor, True, 0.01, across, spread, False)
 
 cdef void heading_bank_fuse_measurement(State* state, int64_t i, int64_t model, double* values, double* parameter, double factor, Parameters* params) noexcept nogil:
     cdef State hypothesis
@@ -1132,6 +1132,9 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double noisy
     cdef bint heard
     cdef double fits
+    cdef double gate
+    cdef double clutter
+    cdef bint scaled
     cdef (double, bint) _t2
     cdef double ratio
     cdef bint fused
@@ -1196,7 +1199,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         seen.variance[a] = (learnt[a] * noisy)
     heard = ((not doubtful) and (not source_health_is_stuck(memory)) and (trusted or by_rivals))
     fits = (rivals_likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0)
-    _t2 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
+    gate, clutter, scaled = params.gates[m], parameter[12], (model == 2)
+    _t2 = measurement_update_update_projected(state, &seen, gate, weight, trusted, clutter, across, spread, scaled)
     ratio = _t2[0]
     fused = _t2[1]
     _t3 = ratio
@@ -1238,6 +1242,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
             state.auxiliary[42] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
+    if ((model == 2) and (not fused)):
+        source_health_note_rejected(memory, values[0], seen.innovation[0])
     return fused
 
 cdef void measurement__judge(State* state, int64_t source, double* whitened, int64_t m, bint same, int64_t t_ns, double correlation, Parameters* params) noexcept nogil:
@@ -1302,7 +1308,7 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
             own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             if (slot == 0):
                 own = rivals_fit_lie(&rival, &seen, weight, across, spread, own)
-            _t1 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread)
+            _t1 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread, (model == 2))
             ratio = _t1[0]
             _fused = _t1[1]
             if ((slot == 0) and (ratio <= 1)):
@@ -1338,7 +1344,7 @@ cdef void measurement__fuse_height(State* state, int64_t source, double* values,
     seen.innovation[0], seen.common[0] = seen.innovation[2], seen.common[2]
     seen.variance[0] = (seen.variance[2] * stretch)
     measurement_update_project(state, &seen, across, spread)
-    _t1 = measurement_update_update_projected(state, &seen, params.gates[1], 1.0, trusted, parameter[12], across, spread)
+    _t1 = measurement_update_update_projected(state, &seen, params.gates[1], 1.0, trusted, parameter[12], across, spread, False)
     ratio = _t1[0]
     fused = _t1[1]
     if (fused or (not trusted) or (not (ratio < INFINITY))):
@@ -1457,13 +1463,13 @@ cdef bint measurement_update_whiten(double* spread, double* innovation, double* 
         whitened[i] = (rest / lower[(i) * 3 + i])
     return True
 
-cdef (double, bint) measurement_update_update(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter) noexcept nogil:
+cdef (double, bint) measurement_update_update(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, bint given) noexcept nogil:
     cdef double across[3 * n]
     cdef double spread[3 * 3]
     measurement_update_project(state, seen, across, spread)
-    return measurement_update_update_projected(state, seen, gate, factor, trusted, clutter, across, spread)
+    return measurement_update_update_projected(state, seen, gate, factor, trusted, clutter, across, spread, given)
 
-cdef (double, bint) measurement_update_update_projected(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, double* across, double* spread) noexcept nogil:
+cdef (double, bint) measurement_update_update_projected(State* state, Observation* seen, double gate, double factor, bint trusted, double clutter, double* across, double* spread, bint given) noexcept nogil:
     cdef int64_t m
     cdef double* p
     cdef double whitened[3]
@@ -1471,11 +1477,10 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     cdef int64_t a
     cdef double ratio
     cdef double share
-    cdef double lower[3 * 3]
+    cdef double gain[3 * n]
     cdef double before[n * n]
     cdef int64_t i
     cdef int _i
-    cdef double gain[3 * n]
     cdef double error[n]
     cdef double mixed
     cdef double _t1
@@ -1497,13 +1502,12 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
         share = measurement_update_detection(distance, m, clutter)
         if (share < 1e-06):
             return (ratio, False)
-    if (not measurement_update_cholesky(spread, seen.variance, factor, m, lower)):
+    if (not measurement_update__make_gain(p, seen, factor, given, across, spread, gain)):
         return (ratio, False)
     if (share < 1):
         for i in range(n):
             for _i in range(n):
                 (before + (i) * n)[_i] = (p + (i) * n)[_i]
-    measurement_update__solve(lower, across, m, gain)
     measurement_update__joseph(p, seen, factor, across, gain)
     memset(error, 0, n * sizeof(double))
     for a in range(m):
@@ -1521,15 +1525,30 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     measurement_update_inject(state, error)
     return (ratio, (share >= 0.5))
 
-cdef void measurement_update__solve(double* lower, double* across, int64_t m, double* gain) noexcept nogil:
-    cdef int64_t i
+cdef bint measurement_update__make_gain(double* p, Observation* seen, double factor, bint given, double* across, double* spread, double* gain) noexcept nogil:
+    cdef double weighed[3 * 3]
+    cdef double lower[3 * 3]
+    cdef int64_t a
     cdef int _i
+    for a in range(seen.m):
+        for _i in range(n):
+            (gain + (a) * n)[_i] = (across + (a) * n)[_i]
+        for _i in range(3):
+            (weighed + (a) * 3)[_i] = (spread + (a) * 3)[_i]
+    if given:
+        measurement_update_give_scale(p, seen.m, gain, weighed)
+    if (not measurement_update_cholesky(weighed, seen.variance, factor, seen.m, lower)):
+        return False
+    measurement_update__solve(lower, seen.m, gain)
+    return True
+
+cdef void measurement_update__solve(double* lower, int64_t m, double* gain) noexcept nogil:
+    cdef int64_t i
     cdef int64_t k
+    cdef int _i
     cdef double _t1
     cdef double _t2
     for i in range(m):
-        for _i in range(n):
-            (gain + (i) * n)[_i] = (across + (i) * n)[_i]
         for k in range(i):
             axpy(gain + (i) * n, (-lower[(i) * 3 + k]), gain + (k) * n)
         _t1 = lower[(i) * 3 + i]
@@ -1541,6 +1560,22 @@ cdef void measurement_update__solve(double* lower, double* across, int64_t m, do
         _t2 = lower[(i) * 3 + i]
         for _i in range(n):
             (gain + (i) * n)[_i] /= _t2
+
+cdef void measurement_update_give_scale(double* p, int64_t m, double* across, double* spread) noexcept nogil:
+    cdef double variance
+    cdef double by[3]
+    cdef int64_t a
+    cdef int64_t i
+    variance = p[(15) * n + 15]
+    if (not (variance > 0)):
+        return
+    for a in range(m):
+        by[a] = across[(a) * n + 15]
+    for a in range(m):
+        axpy(across + (a) * n, ((-by[a]) / variance), p + (15) * n)
+        across[(a) * n + 15] = 0.0
+        for i in range(m):
+            spread[(a) * 3 + i] -= ((by[a] * by[i]) / variance)
 
 cdef void measurement_update__joseph(double* p, Observation* seen, double factor, double* across, double* gain) noexcept nogil:
     cdef int64_t a
@@ -1779,6 +1814,16 @@ cdef void motion_constraints_constrain(State* state, Parameters* params) noexcep
     elif rolling:
         motion_constraints__apply(state, 0, params, 1.0)
 
+cdef void motion_constraints_roll(State* state, Parameters* params) noexcept nogil:
+    cdef (bint, bint) _t1
+    cdef bint _still
+    cdef bint rolling
+    _t1 = motion_constraints_constraints_due(state, params)
+    _still = _t1[0]
+    rolling = _t1[1]
+    if (rolling and (not motion_constraints_rests(state, params))):
+        motion_constraints__apply(state, 0, params, 1.0)
+
 cdef (bint, bint) motion_constraints_constraints_due(State* state, Parameters* params) noexcept nogil:
     cdef int64_t now
     cdef bint still
@@ -1809,7 +1854,7 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* par
     model_with_rate_noise(state, &seen)
     measurement_update_project(state, &seen, across, spread)
     fits = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
-    _t1 = measurement_update_update_projected(state, &seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+    _t1 = measurement_update_update_projected(state, &seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
     ratio = _t1[0]
     fused = _t1[1]
     if (state.stamps[22] > 0):
@@ -1837,7 +1882,7 @@ cdef void motion_constraints__apply_to_rivals(State* state, int64_t which, Param
                 measurement_update_project(&rival, &seen, across, spread)
                 own = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
                 rivals_weigh(state, slot, own, fits)
-                measurement_update_update_projected(&rival, &seen, params.gates[seen.m], factor, True, 0.0, across, spread)
+                measurement_update_update_projected(&rival, &seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
     rivals_decide(state, params)
 
 # ---------------- fusiond.filter.north_east_down
@@ -2254,9 +2299,7 @@ cdef void model_point_velocity_v(State* state, double* point_b, int64_t axes, do
 # ---------------- fusiond.filter.observations.non_holonomic
 
 cdef bint non_holonomic_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
-    cdef double velocity_v[3]
-    non_holonomic__observe(state, parameter, seen, velocity_v)
-    return (fabs(velocity_v[0]) >= parameter[5])
+    return (non_holonomic_observe_at_any_speed(state, parameter, seen) >= parameter[5])
 
 cdef double non_holonomic_observe_at_any_speed(State* state, double* parameter, Observation* seen) noexcept nogil:
     cdef double velocity_v[3]
@@ -2455,6 +2498,9 @@ cdef void rivals_watch_inertial(State* state, Observation* seen, double factor, 
 cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     cdef State rival
     cdef int64_t k
+    state.auxiliary[41] = 1e-06
+    if (state.auxiliary[68] != 0):
+        return
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
         rival = hypothesis_of(state, 0)
@@ -2463,7 +2509,6 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
             rival.covariance[(k) * n + k] += (0.1 * rivals_lie_variance(k))
     if (state.bank[(3) * BLOCK + 0] == 0):
         rivals_open_slot(state, 3, odds)
-    state.auxiliary[41] = 1e-06
 
 cdef void rivals_with_lie(Observation* seen, double* spread, double scale, double* widened) noexcept nogil:
     cdef int64_t i
@@ -2547,6 +2592,8 @@ cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nog
     cdef State rival
     cdef int _i
     cdef int64_t k
+    if (state.auxiliary[68] != 0):
+        return
     if (state.stamps[22] == 0):
         state.auxiliary[40] = 1.0
     if (state.bank[(slot) * BLOCK + 0] == 0):
@@ -2567,6 +2614,11 @@ cdef void rivals_close_slot(State* state, int64_t slot) noexcept nogil:
         state.stamps[22] -= 1
     for _i in range(BLOCK):
         (state.bank + (slot) * BLOCK)[_i] = 0.0
+
+cdef void rivals_close_all(State* state) noexcept nogil:
+    cdef int64_t slot
+    for slot in range(4):
+        rivals_close_slot(state, slot)
 
 cdef bint rivals_uses(State* state, int64_t slot, int64_t source, Parameters* params) noexcept nogil:
     cdef int64_t suspect
@@ -3012,6 +3064,16 @@ cdef bint source_health_arrive(double* memory, int64_t* stamps, double* values, 
         memory[13] += (share * ((10.0 if 10.0 < elapsed else elapsed) - memory[13]))
     return same
 
+cdef void source_health_note_rejected(double* memory, double reading, double innovation) noexcept nogil:
+    cdef double expected
+    cdef double share
+    expected = fabs((reading - innovation))
+    if (expected < 2.0):
+        return
+    share = (0.02 if (memory[23] > 0) else 1.0)
+    memory[22] += (share * (fabs(reading) - memory[22]))
+    memory[23] += (share * (expected - memory[23]))
+
 # ---------------- fusiond.filter.state
 
 cdef bint state_is_finite(State* state) noexcept nogil:
@@ -3058,6 +3120,8 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
             lost = (variance > portable_square(0.20943951023931956))
             if (not (step__fuse_while_lost(state, row, params, variance) if lost else measurement_fuse_measurement(state, row, params))):
                 row.outcome = 1
+            if (coasted and (not lost)):
+                motion_constraints_roll(state, params)
         step_guard(state)
     state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
 
@@ -3133,6 +3197,8 @@ cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* par
     cdef State rival
     begin = (<int64_t>(state.stamps[0]))
     step_advance(state, t_ns, imu, params)
+    if ((state.stamps[22] > 0) and (state.auxiliary[68] != 0)):
+        rivals_close_all(state)
     if (state.stamps[22] > 0):
         for slot in range(4):
             if (state.bank[(slot) * BLOCK + 0] > 0):
@@ -3173,7 +3239,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     frozen = (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE))
     if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > params.imu_gap_ns) or frozen):
         strapdown_coast(state, dt, &params.noise, motion_constraints_rests(state, params))
-        a[36] = (0.5 * 0.5)
+        a[36] = (0.05 * 0.05)
         return
     sample = imu.values
     until = (<int64_t>imu.t_ns)
@@ -3318,6 +3384,7 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     if (not (believed and trusted and source_health_is_trusted(memory))):
         row.outcome = 1
         return
+    strapdown_end_coasting(state)
     step_hold(state, row.values, t_ns)
     a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
@@ -3326,16 +3393,15 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
     cdef double* a
     cdef int64_t i
     cdef double _t1
-    cdef double _t2
     a = state.auxiliary
     state.stamps[1] = t_ns
     for i in range(3):
         _t1 = values[i]
         a[(0 + i)] = _t1
         a[(6 + i)] = _t1
-        _t2 = values[(3 + i)]
-        a[(3 + i)] = _t2
-        a[(9 + i)] = _t2
+        a[(3 + i)] = values[(3 + i)]
+        if (a[68] == 0.0):
+            a[(9 + i)] = values[(3 + i)]
 
 cdef void step_guard(State* state) noexcept nogil:
     cdef int64_t i
@@ -3691,6 +3757,15 @@ cdef void strapdown_add_white_noise(double* p, double dt, double accel, double g
         p[((3 + i)) * n + (0 + i)] += quadratic
 
 cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noexcept nogil:
+    cdef double _t1
+    cdef int64_t parts
+    cdef int64_t _part
+    _t1 = ceil((dt / 0.05))
+    parts = (<int64_t>((_t1 if _t1 > 1.0 else 1.0)))
+    for _part in range(parts):
+        strapdown__coast(state, (dt / parts), noise, rests)
+
+cdef void strapdown__coast(State* state, double dt, Noise* noise, bint rests) noexcept nogil:
     cdef double* x
     cdef double* p
     cdef int _i
@@ -3725,6 +3800,11 @@ cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noe
     _t1 = sqrt((((r[0] * r[0]) + (r[1] * r[1])) + (r[2] * r[2])))
     for _i in range(3):
         up_e[_i] = (r[_i] / _t1)
+    if (state.stamps[10] == 2):
+        strapdown_begin_coasting(state)
+        strapdown__turn(state, dt, up_e)
+        linear_mirror(p)
+        return
     rotation_cross(up_e, x + 3, sideways_e)
     memset(turned, 0, n * sizeof(double))
     memset(displaced, 0, n * sizeof(double))
@@ -3744,3 +3824,170 @@ cdef void strapdown_coast(State* state, double dt, Noise* noise, bint rests) noe
         for _i in range(n):
             (p + (i) * n)[_i] += (((_t2 * turned[_i]) + (_t3 * displaced[_i])) + (second * ((_t4 * displaced[_i]) + (_t5 * turned[_i]))))
     linear_mirror(p)
+
+cdef void strapdown_begin_coasting(State* state) noexcept nogil:
+    cdef double* a
+    cdef double* p
+    cdef int64_t bias
+    cdef int _i
+    cdef int64_t i
+    cdef int64_t j
+    a = state.auxiliary
+    p = state.covariance
+    bias = 9
+    if (a[68] == 0.0):
+        a[68] = 1.0
+        for _i in range(3):
+            (a + 69)[_i] = (state.nominal + 10)[_i]
+        for i in range(3):
+            for j in range(3):
+                a[((72 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
+    for _i in range(3):
+        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 69)[_i])
+    for _i in range(3):
+        (state.nominal + 10)[_i] = (a + 69)[_i]
+    a[36] = (0.05 * 0.05)
+
+cdef void strapdown_end_coasting(State* state) noexcept nogil:
+    cdef double* a
+    cdef double* p
+    cdef int64_t bias
+    cdef int _i
+    cdef int64_t i
+    cdef int64_t j
+    a = state.auxiliary
+    p = state.covariance
+    bias = 9
+    if (a[68] == 0.0):
+        return
+    a[68] = 0.0
+    for _i in range(3):
+        (state.nominal + 10)[_i] = (a + 69)[_i]
+    for i in range(3):
+        for _i in range(n):
+            (p + ((bias + i)) * n)[_i] = 0.0
+        for _i in range(n):
+            (p + (bias + i))[_i * n] = 0.0
+    for i in range(3):
+        for j in range(3):
+            p[((bias + i)) * n + (bias + j)] = a[((72 + (3 * i)) + j)]
+
+cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef double* a
+    cdef int64_t bias
+    cdef double c[3 * 3]
+    cdef double rate_b[3]
+    cdef int _i
+    cdef double up_b[3]
+    cdef double speed
+    cdef double turn[4]
+    cdef double _t1
+    cdef double _t2[3]
+    cdef double mat[3 * 3]
+    cdef double _t3[3]
+    cdef double _t4[4]
+    cdef double _t5[4]
+    cdef double sideways_e[3]
+    cdef double rows[6 * n]
+    cdef double _t6
+    cdef double _t7
+    cdef double _t8
+    cdef double by_rate[n]
+    cdef int64_t i
+    cdef double along
+    cdef double across
+    cdef double _t9
+    cdef double _t10
+    cdef double _t11
+    cdef double _t12
+    cdef double _t13
+    cdef double _t14
+    cdef double columns[6 * n]
+    cdef double _t15
+    cdef double _t16
+    cdef double _t17
+    cdef double _t18
+    cdef double _t19
+    cdef double _t20
+    cdef double _t21
+    cdef double _t22
+    cdef double _t23
+    cdef double kept
+    cdef double fresh
+    cdef int64_t j
+    x = state.nominal
+    p = state.covariance
+    a = state.auxiliary
+    bias = 9
+    rotation_matrix(x + 6, c)
+    for _i in range(3):
+        rate_b[_i] = ((a + 9)[_i] - (x + 10)[_i])
+    rotation_transposed_times(c, up_e, up_b)
+    speed = (((up_b[0] * rate_b[0]) + (up_b[1] * rate_b[1])) + (up_b[2] * rate_b[2]))
+    _t1 = (speed * dt)
+    for _i in range(3):
+        _t2[_i] = (up_e[_i] * _t1)
+    rotation_quaternion_exp(_t2, turn)
+    rotation_matrix(turn, mat)
+    rotation_times(mat, x + 3, _t3)
+    for _i in range(3):
+        (x + 3)[_i] = _t3[_i]
+    rotation_quaternion_multiply(turn, x + 6, _t5)
+    rotation_normalised(_t5, _t4)
+    for _i in range(4):
+        (x + 6)[_i] = _t4[_i]
+    rotation_cross(up_e, x + 3, sideways_e)
+    _t6 = up_b[0]
+    _t7 = up_b[1]
+    _t8 = up_b[2]
+    for _i in range(n):
+        by_rate[_i] = (((_t6 * (p + (bias) * n)[_i]) + (_t7 * (p + ((bias + 1)) * n)[_i])) + (_t8 * (p + ((bias + 2)) * n)[_i]))
+    for i in range(3):
+        along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
+        _t9 = mat[(i) * 3 + 0]
+        _t10 = mat[(i) * 3 + 1]
+        _t11 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (rows + (i) * n)[_i] = ((((_t9 * (p + (3) * n)[_i]) + (_t10 * (p + (4) * n)[_i])) + (_t11 * (p + (5) * n)[_i])) + (along * by_rate[_i]))
+        _t12 = mat[(i) * 3 + 0]
+        _t13 = mat[(i) * 3 + 1]
+        _t14 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (rows + ((3 + i)) * n)[_i] = ((((_t12 * (p + (6) * n)[_i]) + (_t13 * (p + (7) * n)[_i])) + (_t14 * (p + (8) * n)[_i])) + (across * by_rate[_i]))
+    for i in range(6):
+        for _i in range(n):
+            (p + ((3 + i)) * n)[_i] = (rows + (i) * n)[_i]
+    _t15 = up_b[0]
+    _t16 = up_b[1]
+    _t17 = up_b[2]
+    for _i in range(n):
+        by_rate[_i] = (((_t15 * (p + bias)[_i * n]) + (_t16 * (p + (bias + 1))[_i * n])) + (_t17 * (p + (bias + 2))[_i * n]))
+    for i in range(3):
+        along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
+        _t18 = mat[(i) * 3 + 0]
+        _t19 = mat[(i) * 3 + 1]
+        _t20 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (columns + (i) * n)[_i] = ((((_t18 * (p + 3)[_i * n]) + (_t19 * (p + 4)[_i * n])) + (_t20 * (p + 5)[_i * n])) + (along * by_rate[_i]))
+        _t21 = mat[(i) * 3 + 0]
+        _t22 = mat[(i) * 3 + 1]
+        _t23 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (columns + ((3 + i)) * n)[_i] = ((((_t21 * (p + 6)[_i * n]) + (_t22 * (p + 7)[_i * n])) + (_t23 * (p + 8)[_i * n])) + (across * by_rate[_i]))
+    for i in range(6):
+        for _i in range(n):
+            (p + (3 + i))[_i * n] = (columns + (i) * n)[_i]
+    kept = portable_exp(((-dt) / 1.5))
+    for i in range(3):
+        for _i in range(n):
+            (p + ((bias + i)) * n)[_i] *= kept
+    for i in range(3):
+        for _i in range(n):
+            (p + (bias + i))[_i * n] *= kept
+    fresh = (portable_square(0.25) * (1 - (kept * kept)))
+    for i in range(3):
+        a[(9 + i)] = (x[(10 + i)] + ((speed * kept) * up_b[i]))
+        for j in range(3):
+            p[((bias + i)) * n + (bias + j)] += ((fresh * up_b[i]) * up_b[j])

@@ -28,9 +28,9 @@ def parameters(motion: Motion) -> Array:
 
 @compiled
 def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
-    """Innovation (2,) [m/s], vehicle axes right and down; nothing below the least speed. There are no values."""
-    velocity_v = _observe(state, parameter, seen)
-    return abs(velocity_v[0]) >= parameter[MIN_SPEED]
+    """Innovation (2,) [m/s], vehicle axes right and down; nothing below the least speed, in whatever direction: a state that
+    slides sideways must not escape. There are no values."""
+    return observe_at_any_speed(state, parameter, seen) >= parameter[MIN_SPEED]
 
 
 @compiled

@@ -214,7 +214,7 @@ def without(silence_s: float, events: list[Measurement]) -> list[Measurement]:
     return [event for event in events if event.t_ns not in silent or isinstance(event.payload, WheelSpeed)]
 
 
-@pytest.mark.parametrize(("silence_s", "resets"), [(0.4, 0), (1.0, 1), (3.0, 1), (8.0, 1)])
+@pytest.mark.parametrize(("silence_s", "resets"), [(0.4, 0), (1.0, 0), (3.0, 1), (8.0, 1)])
 def test_an_autopilot_that_reboots_in_a_bend(compiled: bool, silence_s: float, resets: int) -> None:
     """It comes back with the vehicle turned by up to 90 deg. A heading that is lost is found anew; nothing is blamed."""
     truth = bend()
@@ -268,7 +268,7 @@ def test_kernels_agree_over_a_reboot() -> None:
 
 def test_a_silent_imu_in_a_tunnel(compiled: bool) -> None:
     """Without GNSS nothing finds the heading: as it is, far less certain, it is better than none."""
-    events = [e for e in without(1.0, measurements(bend())) if e.t_ns < T0 + 3 * SECOND or not e.source.startswith("gps0")]
+    events = [e for e in without(3.0, measurements(bend())) if e.t_ns < T0 + 3 * SECOND or not e.source.startswith("gps0")]
     head = fuse(config(), events, compiled).history.head
     assert (head.stamps[PHASE], head.stamps[RESETS]) == (RUNNING, 0)
     assert yaw_variance(head) > LOST_HEADING**2

@@ -27,6 +27,7 @@ from fusiond.filter.state import (
     NOMINAL,
     SOURCE_STAMPS_SIZE,
     VELOCITY_E,
+    WHEEL_SCALE,
     T,
 )
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
@@ -280,3 +281,43 @@ def test_sources_that_were_never_heard(compiled: bool) -> None:
     fusion = fuse(config(), events, compiled)
     assert fusion.health(T0 + 6 * SECOND)["rear_right"].status == "absent"
     assert fusion.history.head.memory[:, [NOISY, BIASED, FROZEN]].max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (3.6, "it reads 3.60 times the vehicle's speed: is the unit km/h?"),
+        (0.0, "it reads 0 while the vehicle moves"),
+        (1.5, "it reads 1.50 times the vehicle's speed"),
+    ],
+)
+def test_a_wheel_that_is_wrong_for_good_is_named(factor: float, words: str) -> None:
+    memory = np.zeros(MEMORY_SIZE)
+    assert health.misreading(memory) == ""
+    for speed in (0.5, 1.9, -1.0):
+        health.note_rejected(memory, factor * speed, factor * speed - speed)  # too slow to tell
+    assert health.misreading(memory) == ""
+    for speed in np.linspace(-20.0, 20.0, 50):
+        health.note_rejected(memory, factor * speed, factor * speed - speed)
+    assert health.misreading(memory) == words
+
+
+@pytest.mark.parametrize(("factor", "words"), [(3.6, "is the unit km/h?"), (0.0, "it reads 0 while the vehicle moves")])
+def test_wheels_of_no_use_do_not_harm_the_others(factor: float, words: str, compiled: bool) -> None:
+    """Two wheels of four, from the begin: the health says what they read, and the scale is that of the others."""
+
+    def read(event: Measurement) -> Measurement:
+        if event.source.startswith("front") and isinstance(event.payload, WheelSpeed):
+            return msgspec.structs.replace(event, payload=WheelSpeed(factor * event.payload.speed))
+        return event
+
+    fusion = fuse(config(), [read(event) for event in measurements(town(30.0))], compiled)
+    head = fusion.history.head
+    for wheel, belief in fusion.health(int(head.stamps[T])).items():
+        if wheel.startswith("front"):
+            assert belief.status in ("biased", "frozen")
+            assert words in belief.reason
+        elif wheel.startswith("rear"):
+            assert belief.status == "nominal"
+            assert fusion.outcomes()[wheel]["REJECTED"] < 0.05 * fusion.outcomes()[wheel]["FUSED"]
+    assert abs(head.nominal[WHEEL_SCALE.start]) < 0.01

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import math
+
+import msgspec
 import numpy as np
 import pytest
 
+from fusiond.estimator.fusion import Fusion
+from fusiond.events import Measurement, WheelSpeed
 from fusiond.filter.kernel.interpreted import make_kernel
 from fusiond.filter.parameters import make_parameters
 from fusiond.filter.rows import ROW
-from fusiond.filter.state import ALIGNING, CHOOSING, EMPTY, PHASE, RUNNING, T_IMU, FilterState, T
+from fusiond.filter.state import (
+    ALIGNING,
+    CHOOSING,
+    EMPTY,
+    GYRO_BIAS_B,
+    PHASE,
+    POSITION_E,
+    RESETS,
+    RUNNING,
+    T_IMU,
+    FilterState,
+    T,
+)
 from fusiond.filter.step import can_step, first_changed, yaw_variance
-from tests.helpers.streams import MS, SECOND, T0, config, running_state
+from fusiond.maths.typed import Array
+from fusiond.units import nanoseconds
+from tests.helpers.streams import MS, SECOND, T0, config, drive, measurements, ramp, running_state
 
 PARAMS = make_parameters(config(filter={"restart_gap_s": 30.0, "imu_gap_s": 0.2}))
 IMU, POSITION, WHEEL = (PARAMS.sources.index(name) for name in ("imu0", "gps0.position", "front_left"))
@@ -90,3 +109,55 @@ def test_yaw_variance_is_that_about_the_vertical() -> None:
     axis = np.array([np.sin(np.radians(60.0)), 0.0, np.cos(np.radians(60.0))])
     state.covariance[6:9, 6:9] = 0.04 * np.outer(axis, axis)
     assert yaw_variance(state) == pytest.approx(0.01, rel=1e-12)
+
+
+HALF_TRACK = 0.78  # m
+
+
+@pytest.mark.parametrize("how", ["silent", "frozen"])
+def test_the_wheels_of_an_axle_turn_a_state_without_inertial_sensor(how: str, compiled: bool) -> None:
+    """Without GNSS and, for 2 s in a slalom, without an inertial sensor that is of use, two rear wheels are all there is.
+    The published rate is true meanwhile, and the gyro bias is not touched by it."""
+    pace = 0.5
+
+    def yaw(t: Array) -> Array:
+        return 0.7 + 0.6 * np.sin(pace * t) * ramp(t, 3.0, 6.0)
+
+    truth = drive(40.0, lambda t: 12.0 * ramp(t, 3.0, 4.0), yaw)
+    rate = np.gradient(yaw(truth.seconds), truth.seconds)
+    events = [e for e in measurements(truth, ()) if e.t_ns < T0 + 24 * SECOND or not e.source.startswith("gps0")]
+    silent = range(T0 + 25 * SECOND, T0 + 27 * SECOND)
+    last = next(e.payload for e in events if e.source == "imu0" and e.t_ns >= silent.start)
+    if how == "silent":
+        events = [e for e in events if e.source != "imu0" or e.t_ns not in silent]
+    else:
+        stuck = [e for e in events if e.source == "imu0" and e.t_ns in silent]
+        others = [e for e in events if e.source != "imu0" or e.t_ns not in silent]
+        events = others + [msgspec.structs.replace(e, payload=last) for e in stuck]
+    for name, y in (("rear_left", -HALF_TRACK), ("rear_right", HALF_TRACK)):
+        for i, k in enumerate(range(0, len(truth.seconds), 5)):
+            t_ns = T0 + nanoseconds(float(truth.seconds[k]))
+            speed = WheelSpeed(float(truth.speed[k] - rate[k] * y))
+            events.append(Measurement(t_ns, name, i, t_ns + 5_000_000, speed))
+    settings = config(("rear_left", "rear_right"), wheel={"sigma_mps": 0.03})
+    sides = {"rear_left": -HALF_TRACK, "rear_right": HALF_TRACK}
+    placed = {n: msgspec.structs.replace(w, position_m=(0.0, sides[n], 0.0)) for n, w in settings.wheel.items()}
+    fusion = Fusion(msgspec.structs.replace(settings, wheel=placed), compiled)
+    bias = np.zeros(3)
+    for event in sorted(events, key=lambda event: event.key):
+        fusion.fuse(event)
+        if event.source == "rear_right" and event.t_ns == T0 + 24_900_000_000:
+            bias = fusion.history.head.nominal[GYRO_BIAS_B].copy()
+        if event.source == "rear_right" and event.t_ns == T0 + 26_900_000_000:
+            found = fusion.solution_at(event.t_ns).state
+            assert found is not None
+            assert abs(found.angular_rate_b[2] - rate[truth.at(26.9)]) < 0.06
+            np.testing.assert_allclose(found.gyro_bias, bias, atol=1e-3)
+    head = fusion.history.head
+    assert head.stamps[RESETS] == 0
+    heading = fusion.solution_at(int(head.stamps[T])).state
+    assert heading is not None
+    w, x, y, z = heading.quaternion_nb
+    off = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - float(yaw(truth.seconds)[-1])
+    assert abs(math.degrees(off)) < 2.0
+    assert np.linalg.norm(head.nominal[POSITION_E] - truth.position_e[truth.at(40.0)]) < 12.0

@@ -178,11 +178,13 @@ def test_all_that_can_be_learnt() -> None:
 
 
 def test_an_imu_that_falls_silent() -> None:
-    """At rest and in motion; briefly, and until the heading is lost; then the filter aligns anew."""
+    """At rest and in motion; briefly, and, with GNSS, until the heading is lost; then the filter aligns anew."""
     truth = drive(14.0, lambda t: 10.0 * ramp(t, 4.0, 3.0), lambda t: 0.7 + 0.15 * np.clip(t - 5.0, 0.0, None), rate=25.0)
     holes = [(2.0, 3.0), (5.0, 5.3), (8.0, 10.0)]
 
     def change(event: Measurement, t: float) -> Payload | None:
+        if event.source.startswith("gps0") and holes[2][0] < t < holes[2][1]:
+            return None
         return None if event.source == "imu0" and any(begin < t < end for begin, end in holes) else event.payload
 
     events = sensed(truth, change)
