@@ -16,6 +16,7 @@ import numpy as np
 from fusiond.filter.measurement import share_noise
 from fusiond.filter.measurement_update import cholesky, difference, inject, project, update_projected, whiten
 from fusiond.filter.motion_constraints import (
+    GNSS_FRESH_NS,
     NON_HOLONOMIC,
     ZERO_ROTATION,
     ZERO_VELOCITY,
@@ -35,8 +36,12 @@ from fusiond.filter.state import (
     POSITION_E,
     RUNNING,
     T_JUDGED,
+    T_LAST,
+    VELOCITY,
+    VELOCITY_E,
     FilterState,
     ResetReason,
+    T,
     Verdict,
     count_reset,
     is_finite,
@@ -49,6 +54,7 @@ from fusiond.maths.wgs84 import mat_ne
 MIN_WEIGHT = 1e-9  # a hypothesis less likely than this is given up
 FAR = math.radians(30.0)  # rad: a heading this far off is another one, not the same less sure
 DOUBT = 1e-4  # the bank is not collapsed while headings that are far off are likelier than this, all together
+KNOWN_SPEED = 9.0  # a speed is known well where its square is more than so many times its variance
 CLUTTER = OUTLIERS  # share of measurements that fit nothing
 MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 
@@ -114,6 +120,7 @@ def constrain(state: FilterState, params: Parameters) -> None:
     """Apply the motion constraints that are due to every hypothesis; one in which the vehicle goes sideways
     loses weight."""
     still, rolling = constraints_due(state, params)
+    still = still and _stillness_is_known(state, params)
     if not (still or rolling):
         return
     seen = Observation(state.size)
@@ -132,15 +139,31 @@ def constrain(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
+def _stillness_is_known(state: FilterState, params: Parameters) -> bool:
+    """Whether more than a quiet inertial sensor says that the vehicle stands: where its speed is not known, a quiet drive
+    looks the same, and here no gate would notice."""
+    if len(params.wheels) > 0:
+        return True
+    for i in params.velocities:
+        silent_ns = state.stamps[T] - state.source_stamps[i, T_LAST]
+        if silent_ns <= GNSS_FRESH_NS:
+            return True
+    return False
+
+
+@compiled
 def _roll(state: FilterState, params: Parameters) -> None:
-    """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction."""
+    """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction, that is
+    well known: linearised at a guess of the speed, it would tell a heading that nobody knows."""
     parameter = params.constraints[NON_HOLONOMIC]
     seen = Observation(state.size)
     fastest = 0.0
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
-            fastest = max(fastest, non_holonomic.observe_at_any_speed(hypothesis, parameter, seen))
+            speed = non_holonomic.observe_at_any_speed(hypothesis, parameter, seen)
+            if speed > fastest and speed * speed > KNOWN_SPEED * _speed_variance(hypothesis):
+                fastest = speed
     if fastest < parameter[non_holonomic.MIN_SPEED]:
         return
     for i in range(HYPOTHESES):
@@ -149,6 +172,14 @@ def _roll(state: FilterState, params: Parameters) -> None:
             non_holonomic.observe_at_any_speed(hypothesis, parameter, seen)
             with_rate_noise(hypothesis, seen)
             fuse(state, i, hypothesis, seen, 1.0, params)
+
+
+@compiled
+def _speed_variance(state: FilterState) -> float:
+    """Variance of the speed over ground along the way that the vehicle goes [(m/s)^2]."""
+    x, y, z = state.nominal[VELOCITY_E.start], state.nominal[VELOCITY_E.start + 1], state.nominal[VELOCITY_E.start + 2]
+    square = x * x + y * y + z * z
+    return _variance_along(state, VELOCITY.start, x, y, z) / square if square > 0 else math.inf
 
 
 @compiled
@@ -193,7 +224,7 @@ def collapse_if_close(state: FilterState, params: Parameters) -> None:
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
-            own = _variance_along(hypothesis, down[0], down[1], down[2])
+            own = _variance_along(hypothesis, ATTITUDE.start, down[0], down[1], down[2])
             spread += state.bank[i, 0] * (own + (turns[i] - mean) * (turns[i] - mean))
             if abs(turns[i]) > FAR:
                 doubt += state.bank[i, 0]
@@ -202,12 +233,12 @@ def collapse_if_close(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
-def _variance_along(hypothesis: FilterState, x: float, y: float, z: float) -> float:
-    """Variance of the rotation about an earth-fixed axis (x, y, z) [rad^2]."""
-    p, phi = hypothesis.covariance, ATTITUDE.start
+def _variance_along(hypothesis: FilterState, block: int, x: float, y: float, z: float) -> float:
+    """Variance of three error states that begin at `block`, along an earth-fixed axis (x, y, z)."""
+    p = hypothesis.covariance
     turned = np.empty(3)
     for a in range(3):
-        turned[a] = p[phi + a, phi] * x + p[phi + a, phi + 1] * y + p[phi + a, phi + 2] * z
+        turned[a] = p[block + a, block] * x + p[block + a, block + 1] * y + p[block + a, block + 2] * z
     return x * turned[0] + y * turned[1] + z * turned[2]
 
 
