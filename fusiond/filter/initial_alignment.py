@@ -93,7 +93,7 @@ MAX_WINDOW_NS = 3 * SECOND  # and at most so far
 REST_FRESH_NS = 600 * SECOND  # a standstill longer ago says nothing about the gyro bias
 REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
 ALL_ROUND = 12  # hypotheses of an unknown heading
-BANK_SIGMA = math.radians(12.0)  # rad, of each: wide enough to overlap
+BANK_SIGMA = math.radians(12.0)  # rad, of each, at most: wide enough to overlap
 COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a careless mount
 CONTRADICTED_WEIGHT = 0.5  # of a course that contradicts the given heading, in the bank that decides between them
 OWN_ACCELERATION = 1.0  # m/s^2, sigma of the vehicle's own, over half a second, where nothing tells it
@@ -161,7 +161,7 @@ def _start_by_position(state: FilterState, source: int, params: Parameters) -> N
         _start(state, source, None, params.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, params)
         return
     heard_ns = state.stamps[T] - state.source_stamps[source, T_BACK]
-    if _is_sure(_given(state, params)) or (math.isnan(speed) and heard_ns >= MAX_WINDOW_NS):
+    if _is_sure(_given(state, params), params) or (math.isnan(speed) and heard_ns >= MAX_WINDOW_NS):
         _start(state, source, None, square(params.filter.v_max_mps / 3), None, params)
 
 
@@ -193,9 +193,9 @@ def _given(state: FilterState, params: Parameters) -> Heading | None:
     return math.radians(params.filter.heading_deg), math.radians(params.filter.heading_sigma_deg)
 
 
-def _is_sure(heading: Heading | None) -> bool:
-    """Whether a single filter can start from a heading."""
-    return heading is not None and heading[1] <= BANK_SIGMA
+def _is_sure(heading: Heading | None, params: Parameters) -> bool:
+    """Whether a heading leaves nothing to choose for a bank."""
+    return heading is not None and square(heading[1]) <= params.heading_variance
 
 
 @compiled
@@ -230,7 +230,7 @@ def _start(
     with a bank of hypotheses."""
     given, known = _given(state, params), course
     apart = given is not None and course is not None and _contradict(given, course, params)
-    if given is not None and _is_sure(given):
+    if given is not None and _is_sure(given, params):
         known = given
     stored, verdict = hot_start.recall(state, params)
     first = _first_variances(state, stored, params)
@@ -264,13 +264,16 @@ def _contradict(one: Heading, other: Heading, params: Parameters) -> bool:
 
 
 def _all_round(given: Heading | None, weight: float) -> dict[int, tuple[Heading, float]]:
-    """Hypotheses evenly spread over the circle, by their number, and what share each has of `weight`: that of the given
-    heading's normal distribution, wrapped around the circle, which they and their own sigmas make up together. Without
-    one all have the same; of a sure one, one is left."""
+    """Hypotheses by their number, and what share each has of `weight`. They are evenly spread over the circle, and equally
+    likely, or, about a given heading, have the weights with which they and their own sigmas make up its normal
+    distribution, wrapped around the circle; the closer together, the surer it is."""
     yaw, sigma = (0.0, MAX_SPREAD) if given is None else given
-    own, spread = min(sigma, BANK_SIGMA), math.sqrt(max(square(sigma) - square(BANK_SIGMA), 0.0))
+    own = min(sigma / 2, BANK_SIGMA)
     turns = [2 * math.pi * i / ALL_ROUND for i in range(ALL_ROUND)]
-    shares = [1.0 if given is None else _density(turn, spread) for turn in turns]
+    shares = [1.0] * ALL_ROUND
+    if given is not None:
+        turns = [_wrapped(turn) * (own / BANK_SIGMA) for turn in turns]
+        shares = [_density(turn, math.sqrt(square(sigma) - square(own))) for turn in turns]
     total = sum(shares)
     return {i: ((yaw + turns[i], own), weight * shares[i] / total) for i in range(ALL_ROUND) if shares[i] > 0}
 
@@ -292,8 +295,6 @@ def _density(turn: float, sigma: float) -> float:
     """Density at an angle [rad] from the mean of a normal distribution that is wrapped around the circle, against that of
     an even one, which is 1."""
     sigma = min(sigma, MAX_SPREAD)
-    if not sigma > 0:
-        return 1.0 if turn == 0 else 0.0
     rounds = [square((_wrapped(turn) + 2 * math.pi * k) / sigma) / 2 for k in range(-WRAPS, WRAPS + 1)]
     return math.sqrt(2 * math.pi) / sigma * sum(exp(-half) for half in rounds)
 
