@@ -54,7 +54,7 @@ from fusiond.maths.wgs84 import mat_ne
 MIN_WEIGHT = 1e-9  # a hypothesis less likely than this is given up
 FAR = math.radians(30.0)  # rad: a heading this far off is another one, not the same less sure
 DOUBT = 1e-4  # the bank is not collapsed while headings that are far off are likelier than this, all together
-KNOWN_SPEED = 9.0  # a speed is known well where its square is more than so many times its variance
+BANK_SIGMA = math.radians(12.0)  # rad, of each heading at first, at most: wide enough to overlap
 CLUTTER = OUTLIERS  # share of measurements that fit nothing
 MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 
@@ -105,6 +105,8 @@ def fuse_measurement(
     hypothesis = state.hypothesis(i)
     seen = Observation(state.size)
     if model == WHEEL_SPEED:
+        if not _velocity_is_known(state, params):
+            return
         wheel_speed.observe_certain(hypothesis, values, parameter, seen)
         share_noise(hypothesis, seen, parameter)
         across, spread = np.empty((3, state.size)), np.empty((3, 3))
@@ -153,18 +155,15 @@ def _stillness_is_known(state: FilterState, params: Parameters) -> bool:
 
 @compiled
 def _roll(state: FilterState, params: Parameters) -> None:
-    """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction, that is
-    well known: linearised at a guess of the speed, it would tell a heading that nobody knows."""
+    """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction."""
     parameter = params.constraints[NON_HOLONOMIC]
     seen = Observation(state.size)
     fastest = 0.0
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
-            speed = non_holonomic.observe_at_any_speed(hypothesis, parameter, seen)
-            if speed > fastest and speed * speed > KNOWN_SPEED * _speed_variance(hypothesis):
-                fastest = speed
-    if fastest < parameter[non_holonomic.MIN_SPEED]:
+            fastest = max(fastest, non_holonomic.observe_at_any_speed(hypothesis, parameter, seen))
+    if fastest < parameter[non_holonomic.MIN_SPEED] or not _velocity_is_known(state, params):
         return
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
@@ -175,11 +174,19 @@ def _roll(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
-def _speed_variance(state: FilterState) -> float:
-    """Variance of the speed over ground along the way that the vehicle goes [(m/s)^2]."""
-    x, y, z = state.nominal[VELOCITY_E.start], state.nominal[VELOCITY_E.start + 1], state.nominal[VELOCITY_E.start + 2]
-    square = x * x + y * y + z * z
-    return _variance_along(state, VELOCITY.start, x, y, z) / square if square > 0 else math.inf
+def _velocity_is_known(state: FilterState, params: Parameters) -> bool:
+    """Whether what a heading's error makes of the velocity's, which is left out where a measurement is linearised, lies
+    within the noise of the non-holonomic constraint. Until fixes have told the velocity, the constraint and wheels would
+    tell of the heading what nobody knows. For all or for none, so that all are weighed by the same measurements."""
+    unsure = 0.0
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            variance = 0.0
+            for a in range(VELOCITY.start, VELOCITY.stop):
+                variance += hypothesis.covariance[a, a] / 3
+            unsure = max(unsure, variance)
+    return unsure * BANK_SIGMA * BANK_SIGMA <= params.constraints[NON_HOLONOMIC, non_holonomic.LATERAL_VARIANCE]
 
 
 @compiled
@@ -224,7 +231,7 @@ def collapse_if_close(state: FilterState, params: Parameters) -> None:
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
-            own = _variance_along(hypothesis, ATTITUDE.start, down[0], down[1], down[2])
+            own = _variance_along(hypothesis, down[0], down[1], down[2])
             spread += state.bank[i, 0] * (own + (turns[i] - mean) * (turns[i] - mean))
             if abs(turns[i]) > FAR:
                 doubt += state.bank[i, 0]
@@ -233,12 +240,12 @@ def collapse_if_close(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
-def _variance_along(hypothesis: FilterState, block: int, x: float, y: float, z: float) -> float:
-    """Variance of three error states that begin at `block`, along an earth-fixed axis (x, y, z)."""
-    p = hypothesis.covariance
+def _variance_along(hypothesis: FilterState, x: float, y: float, z: float) -> float:
+    """Variance of the rotation about an earth-fixed axis (x, y, z) [rad^2]."""
+    p, phi = hypothesis.covariance, ATTITUDE.start
     turned = np.empty(3)
     for a in range(3):
-        turned[a] = p[block + a, block] * x + p[block + a, block + 1] * y + p[block + a, block + 2] * z
+        turned[a] = p[phi + a, phi] * x + p[phi + a, phi + 1] * y + p[phi + a, phi + 2] * z
     return x * turned[0] + y * turned[1] + z * turned[2]
 
 

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from fusiond.filter import hot_start
+from fusiond.filter.heading_bank import BANK_SIGMA
 from fusiond.filter.motion_constraints import MEAN_FILLED, MEAN_TIME, ZERO_VELOCITY, watch
 from fusiond.filter.observations import (
     GNSS_POSITION,
@@ -93,7 +94,6 @@ MAX_WINDOW_NS = 3 * SECOND  # and at most so far
 REST_FRESH_NS = 600 * SECOND  # a standstill longer ago says nothing about the gyro bias
 REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
 ALL_ROUND = 12  # hypotheses of an unknown heading
-BANK_SIGMA = math.radians(12.0)  # rad, of each, at most: wide enough to overlap
 COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a careless mount
 CONTRADICTED_WEIGHT = 0.5  # of a course that contradicts the given heading, in the bank that decides between them
 OWN_ACCELERATION = 1.0  # m/s^2, sigma of the vehicle's own, over half a second, where nothing tells it

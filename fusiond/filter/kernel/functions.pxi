@@ -417,6 +417,8 @@ cdef void heading_bank_fuse_measurement(State* state, int64_t i, int64_t model, 
     cdef double spread[3 * 3]
     hypothesis = hypothesis_of(state, i)
     if (model == 2):
+        if (not heading_bank__velocity_is_known(state, params)):
+            return
         wheel_speed_observe_certain(&hypothesis, values, parameter, &seen)
         measurement_share_noise(&hypothesis, &seen, parameter)
         measurement_update_project(&hypothesis, &seen, across, spread)
@@ -470,16 +472,15 @@ cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
     cdef double fastest
     cdef int64_t i
     cdef State hypothesis
-    cdef double speed
+    cdef double _t1
     parameter = params.constraints + (0) * PARAMETERS
     fastest = 0.0
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
             hypothesis = hypothesis_of(state, i)
-            speed = non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
-            if ((speed > fastest) and ((speed * speed) > (9.0 * heading_bank__speed_variance(&hypothesis)))):
-                fastest = speed
-    if (fastest < parameter[5]):
+            _t1 = non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
+            fastest = (_t1 if _t1 > fastest else fastest)
+    if ((fastest < parameter[5]) or (not heading_bank__velocity_is_known(state, params))):
         return
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
@@ -488,14 +489,21 @@ cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
             model_with_rate_noise(&hypothesis, &seen)
             heading_bank_fuse(state, i, &hypothesis, &seen, 1.0, params, True)
 
-cdef double heading_bank__speed_variance(State* state) noexcept nogil:
-    cdef double x
-    cdef double y
-    cdef double z
-    cdef double square
-    x, y, z = state.nominal[3], state.nominal[(3 + 1)], state.nominal[(3 + 2)]
-    square = (((x * x) + (y * y)) + (z * z))
-    return ((heading_bank__variance_along(state, 3, x, y, z) / square) if (square > 0) else INFINITY)
+cdef bint heading_bank__velocity_is_known(State* state, Parameters* params) noexcept nogil:
+    cdef double unsure
+    cdef int64_t i
+    cdef State hypothesis
+    cdef double variance
+    cdef int64_t a
+    unsure = 0.0
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, i)
+            variance = 0.0
+            for a in range(3, 6):
+                variance += (hypothesis.covariance[(a) * n + a] / 3)
+            unsure = (variance if variance > unsure else unsure)
+    return (((unsure * 0.20943951023931956) * 0.20943951023931956) <= params.constraints[(0) * PARAMETERS + 3])
 
 cdef void heading_bank_normalise(State* state) noexcept nogil:
     cdef double total
@@ -557,20 +565,22 @@ cdef void heading_bank_collapse_if_close(State* state, Parameters* params) noexc
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
             hypothesis = hypothesis_of(state, i)
-            own = heading_bank__variance_along(&hypothesis, 6, down[0], down[1], down[2])
+            own = heading_bank__variance_along(&hypothesis, down[0], down[1], down[2])
             spread += (state.bank[(i) * BLOCK + 0] * (own + ((turns[i] - mean) * (turns[i] - mean))))
             if (fabs(turns[i]) > 0.5235987755982988):
                 doubt += state.bank[(i) * BLOCK + 0]
     if ((spread <= params.heading_variance) and (doubt <= 0.0001)):
         heading_bank__collapse(state, best, errors)
 
-cdef double heading_bank__variance_along(State* hypothesis, int64_t block, double x, double y, double z) noexcept nogil:
+cdef double heading_bank__variance_along(State* hypothesis, double x, double y, double z) noexcept nogil:
     cdef double* p
+    cdef int64_t phi
     cdef double turned[3]
     cdef int64_t a
     p = hypothesis.covariance
+    phi = 6
     for a in range(3):
-        turned[a] = (((p[((block + a)) * n + block] * x) + (p[((block + a)) * n + (block + 1)] * y)) + (p[((block + a)) * n + (block + 2)] * z))
+        turned[a] = (((p[((phi + a)) * n + phi] * x) + (p[((phi + a)) * n + (phi + 1)] * y)) + (p[((phi + a)) * n + (phi + 2)] * z))
     return (((x * turned[0]) + (y * turned[1])) + (z * turned[2]))
 
 cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noexcept nogil:
