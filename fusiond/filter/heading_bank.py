@@ -38,7 +38,6 @@ from fusiond.filter.state import (
     T_JUDGED,
     T_LAST,
     VELOCITY,
-    VELOCITY_E,
     FilterState,
     ResetReason,
     T,

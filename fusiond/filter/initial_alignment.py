@@ -81,7 +81,7 @@ from fusiond.filter.state import (
 )
 from fusiond.filter.stored_state import StoredState
 from fusiond.maths.portable import atan2, exp, sin_cos, square
-from fusiond.maths.rotation import matrix, matrix_from_euler, product, quaternion
+from fusiond.maths.rotation import cross, matrix, matrix_from_euler, product, quaternion, skew
 from fusiond.maths.typed import Array, compiled
 from fusiond.maths.wgs84 import EQUATOR_GRAVITY, geodetic_trig, mat_ne, mat_ne_from_trig
 from fusiond.units import SECOND
@@ -339,9 +339,10 @@ def _place(
     yaw, yaw_sigma = heading
     to_n = mat_ne_from_trig(*geodetic_trig(*(float(c) for c in auxiliary[FIX_E])))
     mat_nb = matrix_from_euler(*_level(state, measured_n, yaw), yaw)
-    velocity_n = np.zeros(3) if measured_n is None else measured_n
-    since = (stamps[T] - stamps[T_FIX]) * 1e-9
     lever_b = params.model_parameters[source][LEVER_ARM_B]
+    swing_b = np.zeros(3) if measured_n is None else cross(auxiliary[RATE_B] - x[GYRO_BIAS_B], lever_b)
+    velocity_n = np.zeros(3) if measured_n is None else measured_n - product(mat_nb, swing_b)
+    since = (stamps[T] - stamps[T_FIX]) * 1e-9
     x[POSITION_E] = auxiliary[FIX_E] + product(to_n.T, velocity_n * since - product(mat_nb, lever_b))
     x[VELOCITY_E] = product(to_n.T, velocity_n)
     x[QUATERNION_EB] = quaternion(product(to_n.T, mat_nb))
@@ -357,8 +358,20 @@ def _place(
     covariance[ATTITUDE, ATTITUDE] = product(to_n.T * [level, level, square(yaw_sigma)], to_n)
     for i, own in enumerate(first, GYRO_BIAS.start):
         covariance[i, i] = own
+    _tie_to_attitude(state, product(to_n.T, product(mat_nb, lever_b)), product(to_n.T, product(mat_nb, swing_b)))
     if state.size == WIDE_SIZE:
         _tie(state, _gain(state, measured_n))
+
+
+def _tie_to_attitude(state: FilterState, lever_e: Array, swing_e: Array) -> None:
+    """What the first attitude is off by, the first position and velocity are off by as well: they are the antenna's less the
+    arm (3,) [m] and its swing (3,) [m/s]. At rest, no number of fixes tells the one from the other."""
+    covariance = state.covariance
+    by = np.vstack([skew(lever_e), skew(swing_e)])
+    shared = product(by, covariance[ATTITUDE, ATTITUDE])
+    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(shared, by.T)
+    covariance[: VELOCITY.stop, ATTITUDE] = shared
+    covariance[ATTITUDE, : VELOCITY.stop] = shared.T
 
 
 def _tie(state: FilterState, gain_n: Array) -> None:
@@ -374,10 +387,10 @@ def _tie(state: FilterState, gain_n: Array) -> None:
     by[POSITION, 3] = x[VELOCITY_E]
     by[VELOCITY, 3] = by[VELOCITY, 4] = gain_e
     own = slice(ANTENNA_ERROR.start, DELAYS_ERROR.stop)
-    cross = by * np.diag(covariance)[own]
-    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(cross, by.T)
-    covariance[: VELOCITY.stop, own] = cross
-    covariance[own, : VELOCITY.stop] = cross.T
+    shared = by * np.diag(covariance)[own]
+    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(shared, by.T)
+    covariance[: VELOCITY.stop, own] = shared
+    covariance[own, : VELOCITY.stop] = shared.T
 
 
 def _gain(state: FilterState, velocity_n: Array | None) -> Array:
