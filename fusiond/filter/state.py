@@ -125,8 +125,8 @@ T_BACK = _source_stamps.one()  # ns, since when it is heard again after an outag
 SOURCE_STAMPS_SIZE = _source_stamps.size
 
 EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
-HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.filter.heading_bank): twelve all round, and a stored one
-STORED = 12  # the number of that
+HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.filter.heading_bank): twelve all round, and one more
+STORED = 12  # the number of that: a stored heading, or a course that contradicts the given one
 NEVER = -(2**62)
 
 
