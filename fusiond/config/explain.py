@@ -49,7 +49,10 @@ def description(config: Config) -> Iterator[str]:
 def _start(config: Config) -> str:
     settings = config.filter
     if settings.heading_deg is not None:
-        return f"at rest or in motion, heading {settings.heading_deg:g} +- {settings.heading_sigma_deg:g} deg as given"
+        given = f"heading {settings.heading_deg:g} +- {settings.heading_sigma_deg:g} deg as given"
+        if settings.heading_sigma_deg <= settings.heading_spread_deg:
+            return f"at rest or in motion, {given}"
+        return f"{given}: too vague to start at once, so the drive decides"
     return f"level from gravity, heading from the GNSS course above {settings.course_speed_mps:g} m/s"
 
 

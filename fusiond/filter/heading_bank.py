@@ -16,6 +16,7 @@ import numpy as np
 from fusiond.filter.measurement import share_noise
 from fusiond.filter.measurement_update import cholesky, difference, inject, project, update_projected, whiten
 from fusiond.filter.motion_constraints import (
+    GNSS_FRESH_NS,
     NON_HOLONOMIC,
     ZERO_ROTATION,
     ZERO_VELOCITY,
@@ -35,8 +36,11 @@ from fusiond.filter.state import (
     POSITION_E,
     RUNNING,
     T_JUDGED,
+    T_LAST,
+    VELOCITY,
     FilterState,
     ResetReason,
+    T,
     Verdict,
     count_reset,
     is_finite,
@@ -49,6 +53,7 @@ from fusiond.maths.wgs84 import mat_ne
 MIN_WEIGHT = 1e-9  # a hypothesis less likely than this is given up
 FAR = math.radians(30.0)  # rad: a heading this far off is another one, not the same less sure
 DOUBT = 1e-4  # the bank is not collapsed while headings that are far off are likelier than this, all together
+BANK_SIGMA = math.radians(12.0)  # rad, of each heading at first, at most: wide enough to overlap
 CLUTTER = OUTLIERS  # share of measurements that fit nothing
 MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 
@@ -99,6 +104,8 @@ def fuse_measurement(
     hypothesis = state.hypothesis(i)
     seen = Observation(state.size)
     if model == WHEEL_SPEED:
+        if not _velocity_is_known(state, params):
+            return
         wheel_speed.observe_certain(hypothesis, values, parameter, seen)
         share_noise(hypothesis, seen, parameter)
         across, spread = np.empty((3, state.size)), np.empty((3, 3))
@@ -114,6 +121,7 @@ def constrain(state: FilterState, params: Parameters) -> None:
     """Apply the motion constraints that are due to every hypothesis; one in which the vehicle goes sideways
     loses weight."""
     still, rolling = constraints_due(state, params)
+    still = still and _stillness_is_known(state, params)
     if not (still or rolling):
         return
     seen = Observation(state.size)
@@ -132,6 +140,19 @@ def constrain(state: FilterState, params: Parameters) -> None:
 
 
 @compiled
+def _stillness_is_known(state: FilterState, params: Parameters) -> bool:
+    """Whether more than a quiet inertial sensor says that the vehicle stands: where its speed is not known, a quiet drive
+    looks the same, and here no gate would notice."""
+    if len(params.wheels) > 0:
+        return True
+    for i in params.velocities:
+        silent_ns = state.stamps[T] - state.source_stamps[i, T_LAST]
+        if silent_ns <= GNSS_FRESH_NS:
+            return True
+    return False
+
+
+@compiled
 def _roll(state: FilterState, params: Parameters) -> None:
     """The non-holonomic constraint: for all or for none, by the largest speed over ground, in whatever direction."""
     parameter = params.constraints[NON_HOLONOMIC]
@@ -141,7 +162,7 @@ def _roll(state: FilterState, params: Parameters) -> None:
         if state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
             fastest = max(fastest, non_holonomic.observe_at_any_speed(hypothesis, parameter, seen))
-    if fastest < parameter[non_holonomic.MIN_SPEED]:
+    if fastest < parameter[non_holonomic.MIN_SPEED] or not _velocity_is_known(state, params):
         return
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
@@ -149,6 +170,22 @@ def _roll(state: FilterState, params: Parameters) -> None:
             non_holonomic.observe_at_any_speed(hypothesis, parameter, seen)
             with_rate_noise(hypothesis, seen)
             fuse(state, i, hypothesis, seen, 1.0, params)
+
+
+@compiled
+def _velocity_is_known(state: FilterState, params: Parameters) -> bool:
+    """Whether what a heading's error makes of the velocity's, which is left out where a measurement is linearised, lies
+    within the noise of the non-holonomic constraint. Until fixes have told the velocity, the constraint and wheels would
+    tell of the heading what nobody knows. For all or for none, so that all are weighed by the same measurements."""
+    unsure = 0.0
+    for i in range(HYPOTHESES):
+        if state.bank[i, 0] > 0:
+            hypothesis = state.hypothesis(i)
+            variance = 0.0
+            for a in range(VELOCITY.start, VELOCITY.stop):
+                variance += hypothesis.covariance[a, a] / 3
+            unsure = max(unsure, variance)
+    return unsure * BANK_SIGMA * BANK_SIGMA <= params.constraints[NON_HOLONOMIC, non_holonomic.LATERAL_VARIANCE]
 
 
 @compiled

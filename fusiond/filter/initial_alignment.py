@@ -1,8 +1,10 @@
 """How the filter starts: level from gravity, heading from the GNSS course or given, gyro bias from a standstill.
 
 While aligning, the state only gathers: means of the inertial samples (`motion.watch`), the last fix, the velocity at the
-begin of a window. It starts at the first event at which position, level and heading are known. In motion, the vehicle's
-own acceleration, known from the change of GNSS velocity, is taken out of the accelerometer before leveling. What an
+begin of a window. It starts at the first event at which position and level are known: with one heading where that is
+known, else with a bank of them (`fusiond.filter.heading_bank`). In motion, the vehicle's own acceleration, known from the
+change of GNSS velocity, is taken out of the accelerometer before leveling. Where fixes come without a velocity, only the
+bound of the speed is known at first, and the bank finds velocity and heading from the way that the fixes go. What an
 earlier run has stored is judged in `fusiond.filter.hot_start`.
 """
 
@@ -13,6 +15,7 @@ import math
 import numpy as np
 
 from fusiond.filter import hot_start, inertial_sample
+from fusiond.filter.heading_bank import BANK_SIGMA
 from fusiond.filter.motion_constraints import MEAN_FILLED, MEAN_TIME, ZERO_VELOCITY, watch
 from fusiond.filter.observations import (
     GNSS_POSITION,
@@ -68,11 +71,13 @@ from fusiond.filter.state import (
     RUNNING,
     STORED,
     SUSPECT,
+    T_BACK,
     T_CONSTRAINT,
     T_FIRST_VELOCITY,
     T_FIX,
     T_GNSS_ERROR,
     T_IMU,
+    T_LAST,
     T_POSITION,
     T_REST,
     T_START,
@@ -85,11 +90,13 @@ from fusiond.filter.state import (
 )
 from fusiond.filter.stored_state import StoredState
 from fusiond.filter.strapdown import end_coasting
-from fusiond.maths.portable import atan2, sin_cos, square
-from fusiond.maths.rotation import matrix, matrix_from_euler, product, quaternion
+from fusiond.maths.portable import atan2, exp, sin_cos, square
+from fusiond.maths.rotation import cross, matrix, matrix_from_euler, product, quaternion, skew
 from fusiond.maths.typed import Array, compiled
-from fusiond.maths.wgs84 import geodetic_trig, mat_ne, mat_ne_from_trig
+from fusiond.maths.wgs84 import EQUATOR_GRAVITY, geodetic_trig, mat_ne, mat_ne_from_trig
 from fusiond.units import SECOND
+
+Heading = tuple[float, float]  # yaw and its sigma [rad]
 
 FIX_FRESH_NS = 2 * SECOND  # a fix older than this does not start the filter
 MIN_WINDOW_NS = SECOND  # the GNSS velocities that give the vehicle's acceleration lie at least so far apart
@@ -97,8 +104,11 @@ MAX_WINDOW_NS = 3 * SECOND  # and at most so far
 REST_FRESH_NS = 600 * SECOND  # a standstill longer ago says nothing about the gyro bias
 REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a standstill
 ALL_ROUND = 12  # hypotheses of an unknown heading
-BANK_SIGMA = math.radians(12.0)  # rad, of each: wide enough to overlap
 COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a careless mount
+CONTRADICTED_WEIGHT = 0.5  # of a course that contradicts the given heading, in the bank that decides between them
+OWN_ACCELERATION = 1.0  # m/s^2, sigma of the vehicle's own, over half a second, where nothing tells it
+WRAPS = 4  # rounds of the circle either way that such a heading reaches
+MAX_SPREAD = 2 * math.pi  # rad: a heading less certain than this is none
 
 
 def begin(state: FilterState) -> None:
@@ -125,6 +135,8 @@ def gather(state: FilterState, row: Row, params: Parameters) -> None:
         auxiliary[FIX_SLOW_SHARE] = params.model_parameters[source, gnss_position.SLOW_SHARE]
         state.memory[source, FIX_TYPE] = values[gnss_position.TYPE_OF_FIX]
         stamps[T_FIX] = t_ns
+        if state.source_stamps[source, T_LAST] == NEVER:
+            state.source_stamps[source, T_BACK] = t_ns
         _start_by_position(state, source, params)
     elif model == GNSS_VELOCITY:
         _gather_velocity(state, source, values, params)
@@ -160,13 +172,16 @@ def gather_motion(state: FilterState, row: Row, params: Parameters) -> None:
 
 
 def _start_by_position(state: FilterState, source: int, params: Parameters) -> None:
-    """Start at rest; or, where no GNSS velocity is to be had, in a motion that only its bound is known of."""
+    """Start at rest; or in motion, where the heading is given or the receiver gives no velocity, with a velocity of which
+    only the bound is known."""
     speed = _gnss_speed(state)
     if not _leveled(state) or speed >= params.course_speed:
         return
     if _rests(state, params):
         _start(state, source, None, params.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, params)
-    elif _given(state, params) or not params.velocities:
+        return
+    heard_ns = state.stamps[T] - state.source_stamps[source, T_BACK]
+    if _is_sure(_given(state, params), params) or (math.isnan(speed) and heard_ns >= MAX_WINDOW_NS):
         _start(state, source, None, square(params.filter.v_max_mps / 3), None, params)
 
 
@@ -191,11 +206,16 @@ def _gather_velocity(state: FilterState, source: int, values: Array, params: Par
     _start(state, source, velocity_n, variance, course, params)
 
 
-def _given(state: FilterState, params: Parameters) -> tuple[float, float] | None:
-    """The configured heading and its sigma [rad]: of the first start, and of later ones where there is no newer one."""
-    if params.filter.heading_deg is None or (state.stamps[RESETS] and params.velocities):
+def _given(state: FilterState, params: Parameters) -> Heading | None:
+    """The configured heading and its sigma [rad], which are those of the first start."""
+    if params.filter.heading_deg is None or state.stamps[RESETS]:
         return None
     return math.radians(params.filter.heading_deg), math.radians(params.filter.heading_sigma_deg)
+
+
+def _is_sure(heading: Heading | None, params: Parameters) -> bool:
+    """Whether a heading leaves nothing to choose for a bank."""
+    return heading is not None and square(heading[1]) <= params.heading_variance
 
 
 @compiled
@@ -222,37 +242,82 @@ def _start(
     source: int,
     measured_n: Array | None,
     variance: float,
-    heading: tuple[float, float] | None,
+    course: Heading | None,
     params: Parameters,
 ) -> None:
     """Start from what was gathered: with a velocity (3,) [m/s], or None where it was not measured, and its variance; with
-    a heading and sigma [rad], a given one before a measured one; and where there is none, with a bank of hypotheses all
-    round, and a stored one among them."""
-    heading = _given(state, params) or heading
+    the given heading where that is sure, else with the course; and where there is neither, or they contradict each other,
+    with a bank of hypotheses."""
+    given, known = _given(state, params), course
+    apart = given is not None and course is not None and _contradict(given, course, params)
+    if given is not None and _is_sure(given, params):
+        known = given
     stored, verdict = hot_start.recall(state, params)
     first = _first_variances(state, stored, params)
-    if heading is not None:
-        _place(state, source, measured_n, variance, heading, first, params)
+    if known is not None and not apart:
+        _place(state, source, measured_n, variance, known, first, params)
         state.stamps[PHASE] = RUNNING
     else:
-        kept = None
-        if stored is not None:
+        other, weight = course, CONTRADICTED_WEIGHT if course is not None else 0.0
+        if stored is not None and course is None:
             level = _level(state, None, 0.0) if measured_n is None and _rests(state, params) else None
             kept, verdict = hot_start.heading(stored, state, source, level, params)
+            if kept is not None:
+                other, weight = (kept.yaw, kept.sigma), _weight_of(kept, given)
+        hypotheses = _all_round(given, 1.0 - weight)
+        if other is not None:
+            hypotheses[STORED] = other, weight
         state.bank[:] = 0.0
-        headings = [(2 * math.pi * i / ALL_ROUND, BANK_SIGMA) for i in range(ALL_ROUND)]
-        state.bank[:ALL_ROUND, 0] = (1.0 - (kept.weight if kept else 0.0)) / ALL_ROUND
-        if kept:
-            headings.append((kept.yaw, kept.sigma))
-            state.bank[STORED, 0] = kept.weight
-        for i, turned in enumerate(headings):
+        for i, (heading, share) in hypotheses.items():
+            state.bank[i, 0] = share
             state.hypothesis(i).nominal[:] = state.nominal  # biases and calibrations of before
-            _place(state.hypothesis(i), source, measured_n, variance, turned, first, params)
+            _place(state.hypothesis(i), source, measured_n, variance, heading, first, params)
         state.stamps[PHASE] = CHOOSING
     if verdict:
         state.stamps[HOT_START] = verdict
     state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
     state.stamps[T_GNSS_ERROR] = state.stamps[T_FIX]
+
+
+def _contradict(one: Heading, other: Heading, params: Parameters) -> bool:
+    """Whether two headings are further apart than their sigmas explain."""
+    return square(_wrapped(one[0] - other[0])) > params.gates[1] * (square(one[1]) + square(other[1]))
+
+
+def _all_round(given: Heading | None, weight: float) -> dict[int, tuple[Heading, float]]:
+    """Hypotheses by their number, and what share each has of `weight`. They are evenly spread over the circle, and equally
+    likely, or, about a given heading, have the weights with which they and their own sigmas make up its normal
+    distribution, wrapped around the circle; the closer together, the surer it is."""
+    yaw, sigma = (0.0, MAX_SPREAD) if given is None else given
+    own = min(sigma / 2, BANK_SIGMA)
+    turns = [2 * math.pi * i / ALL_ROUND for i in range(ALL_ROUND)]
+    shares = [1.0] * ALL_ROUND
+    if given is not None:
+        turns = [_wrapped(turn) * (own / BANK_SIGMA) for turn in turns]
+        shares = [_density(turn, math.sqrt(square(sigma) - square(own))) for turn in turns]
+    total = sum(shares)
+    return {i: ((yaw + turns[i], own), weight * shares[i] / total) for i in range(ALL_ROUND) if shares[i] > 0}
+
+
+def _weight_of(kept: hot_start.Heading, given: Heading | None) -> float:
+    """The weight of a stored heading, where another is given as well (Bayes)."""
+    if given is None:
+        return kept.weight
+    likelihood = kept.weight * _density(kept.yaw - given[0], math.sqrt(square(given[1]) + square(kept.sigma)))
+    return likelihood / (likelihood + 1.0 - kept.weight)
+
+
+def _wrapped(angle: float) -> float:
+    """An angle [rad], in [-pi, pi)."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def _density(turn: float, sigma: float) -> float:
+    """Density at an angle [rad] from the mean of a normal distribution that is wrapped around the circle, against that of
+    an even one, which is 1."""
+    sigma = min(sigma, MAX_SPREAD)
+    rounds = [square((_wrapped(turn) + 2 * math.pi * k) / sigma) / 2 for k in range(-WRAPS, WRAPS + 1)]
+    return math.sqrt(2 * math.pi) / sigma * sum(exp(-half) for half in rounds)
 
 
 def _first_variances(state: FilterState, stored: StoredState | None, params: Parameters) -> Array:
@@ -286,7 +351,7 @@ def _place(
     source: int,
     measured_n: Array | None,
     variance: float,
-    heading: tuple[float, float],
+    heading: Heading,
     first: Array,
     params: Parameters,
 ) -> None:
@@ -295,14 +360,17 @@ def _place(
     yaw, yaw_sigma = heading
     to_n = mat_ne_from_trig(*geodetic_trig(*(float(c) for c in auxiliary[FIX_E])))
     mat_nb = matrix_from_euler(*_level(state, measured_n, yaw), yaw)
-    velocity_n = np.zeros(3) if measured_n is None else measured_n
-    since = (stamps[T] - stamps[T_FIX]) * 1e-9
     lever_b = params.model_parameters[source][LEVER_ARM_B]
+    swing_b = np.zeros(3) if measured_n is None else cross(auxiliary[RATE_B] - x[GYRO_BIAS_B], lever_b)
+    velocity_n = np.zeros(3) if measured_n is None else measured_n - product(mat_nb, swing_b)
+    since = (stamps[T] - stamps[T_FIX]) * 1e-9
     x[POSITION_E] = auxiliary[FIX_E] + product(to_n.T, velocity_n * since - product(mat_nb, lever_b))
     x[VELOCITY_E] = product(to_n.T, velocity_n)
     x[QUATERNION_EB] = quaternion(product(to_n.T, mat_nb))
     horizontal, vertical = auxiliary[FIX_VARIANCE]
     level = square(math.radians(params.filter.level_sigma_deg))
+    if measured_n is None and not _rests(state, params):
+        level += square(OWN_ACCELERATION / EQUATOR_GRAVITY)
     covariance = state.covariance
     covariance[:] = 0.0
     aged = variance * since * since
@@ -315,8 +383,20 @@ def _place(
     x[GNSS_ERROR_E] = 0.0
     covariance[GNSS_ERROR, GNSS_ERROR] = slow
     covariance[POSITION, GNSS_ERROR] = covariance[GNSS_ERROR, POSITION] = -slow
+    _tie_to_attitude(state, product(to_n.T, product(mat_nb, lever_b)), product(to_n.T, product(mat_nb, swing_b)))
     if state.size == WIDE_SIZE:
         _tie(state, _gain(state, measured_n))
+
+
+def _tie_to_attitude(state: FilterState, lever_e: Array, swing_e: Array) -> None:
+    """What the first attitude is off by, the first position and velocity are off by as well: they are the antenna's less the
+    arm (3,) [m] and its swing (3,) [m/s]. At rest, no number of fixes tells the one from the other."""
+    covariance = state.covariance
+    by = np.vstack([skew(lever_e), skew(swing_e)])
+    shared = product(by, covariance[ATTITUDE, ATTITUDE])
+    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(shared, by.T)
+    covariance[: VELOCITY.stop, ATTITUDE] = shared
+    covariance[ATTITUDE, : VELOCITY.stop] = shared.T
 
 
 def _tie(state: FilterState, gain_n: Array) -> None:
@@ -332,10 +412,10 @@ def _tie(state: FilterState, gain_n: Array) -> None:
     by[POSITION, 3] = x[VELOCITY_E]
     by[VELOCITY, 3] = by[VELOCITY, 4] = gain_e
     own = slice(ANTENNA_ERROR.start, DELAYS_ERROR.stop)
-    cross = by * np.diag(covariance)[own]
-    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(cross, by.T)
-    covariance[: VELOCITY.stop, own] = cross
-    covariance[own, : VELOCITY.stop] = cross.T
+    shared = by * np.diag(covariance)[own]
+    covariance[: VELOCITY.stop, : VELOCITY.stop] += product(shared, by.T)
+    covariance[: VELOCITY.stop, own] = shared
+    covariance[own, : VELOCITY.stop] = shared.T
 
 
 def _gain(state: FilterState, velocity_n: Array | None) -> Array:

@@ -144,12 +144,13 @@ _source_stamps = _Layout()
 T_LAST = _source_stamps.one()  # ns, of its last event
 T_FUSED = _source_stamps.one()  # ns, of its last event fused
 T_REJECTED = _source_stamps.one()  # ns, of the first of an unbroken run of rejections; NEVER if there is none
+T_BACK = _source_stamps.one()  # ns, of its first event before the start
 T_JUDGED = _source_stamps.one()  # ns, of the last look at its health
 SOURCE_STAMPS_SIZE = _source_stamps.size
 
 EMPTY, ALIGNING, RUNNING, CHOOSING = 0, 1, 2, 3
-HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.filter.heading_bank): twelve all round, and a stored one
-STORED = 12  # the number of that
+HYPOTHESES = 13  # of the heading, while it is being chosen (fusiond.filter.heading_bank): twelve all round, and one more
+STORED = 12  # the number of that: a stored heading, or a course that contradicts the given one
 NEVER = -(2**62)
 
 

@@ -585,6 +585,8 @@ cdef void heading_bank_fuse_measurement(State* state, int64_t i, int64_t model, 
     cdef double spread[3 * 3]
     hypothesis = hypothesis_of(state, i)
     if (model == 2):
+        if (not heading_bank__velocity_is_known(state, params)):
+            return
         wheel_speed_observe_certain(&hypothesis, values, parameter, &seen)
         measurement_share_noise(&hypothesis, &seen, parameter)
         measurement_update_project(&hypothesis, &seen, across, spread)
@@ -603,6 +605,7 @@ cdef void heading_bank_constrain(State* state, Parameters* params) noexcept nogi
     _t1 = motion_constraints_constraints_due(state, params)
     still = _t1[0]
     rolling = _t1[1]
+    still = (still and heading_bank__stillness_is_known(state, params))
     if (not (still or rolling)):
         return
     for i in range(13):
@@ -618,6 +621,19 @@ cdef void heading_bank_constrain(State* state, Parameters* params) noexcept nogi
         heading_bank__roll(state, params)
     heading_bank_normalise(state)
 
+cdef bint heading_bank__stillness_is_known(State* state, Parameters* params) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t _k1
+    cdef int64_t silent_ns
+    if (params.wheels_count > 0):
+        return True
+    for _k1 in range(params.velocities_count):
+        i = params.velocities[_k1]
+        silent_ns = (state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0])
+        if (silent_ns <= 2000000000):
+            return True
+    return False
+
 cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
     cdef double* parameter
     cdef Observation seen
@@ -632,7 +648,7 @@ cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
             hypothesis = hypothesis_of(state, i)
             _t1 = non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
             fastest = (_t1 if _t1 > fastest else fastest)
-    if (fastest < parameter[5]):
+    if ((fastest < parameter[5]) or (not heading_bank__velocity_is_known(state, params))):
         return
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
@@ -640,6 +656,22 @@ cdef void heading_bank__roll(State* state, Parameters* params) noexcept nogil:
             non_holonomic_observe_at_any_speed(&hypothesis, parameter, &seen)
             model_with_rate_noise(&hypothesis, &seen)
             heading_bank_fuse(state, i, &hypothesis, &seen, 1.0, params, True)
+
+cdef bint heading_bank__velocity_is_known(State* state, Parameters* params) noexcept nogil:
+    cdef double unsure
+    cdef int64_t i
+    cdef State hypothesis
+    cdef double variance
+    cdef int64_t a
+    unsure = 0.0
+    for i in range(13):
+        if (state.bank[(i) * BLOCK + 0] > 0):
+            hypothesis = hypothesis_of(state, i)
+            variance = 0.0
+            for a in range(3, 6):
+                variance += (hypothesis.covariance[(a) * n + a] / 3)
+            unsure = (variance if variance > unsure else unsure)
+    return (((unsure * 0.20943951023931956) * 0.20943951023931956) <= params.constraints[(0) * PARAMETERS + 3])
 
 cdef void heading_bank_normalise(State* state) noexcept nogil:
     cdef double total
@@ -758,7 +790,7 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     if (state.stamps[21] == 1):
         state_count_reset(state, 5)
     for source in range(state.sources):
-        state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
+        state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 4] = (<int64_t>-4611686018427387904)
 
 # ---------------- fusiond.filter.inertial_sample
 
@@ -2858,7 +2890,7 @@ cdef void source_health_blame_frozen(double* memory, double probability) noexcep
 cdef bint source_health_is_due(int64_t* stamps, int64_t t_ns, double correlation) noexcept nogil:
     cdef int64_t pause
     pause = (<int64_t>((2000000000.0 * correlation)))
-    return ((stamps[3] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[3]) >= (pause if pause > 50000000 else 50000000)))
+    return ((stamps[4] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[4]) >= (pause if pause > 50000000 else 50000000)))
 
 cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened, int64_t m, bint same, int64_t t_ns) noexcept nogil:
     cdef double elapsed
@@ -2867,9 +2899,9 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
     if ((((memory[4] + memory[5]) + memory[6]) + memory[7]) == 0):
         source_health_begin(memory)
     elapsed = 20.0
-    if (stamps[3] != (<int64_t>-4611686018427387904)):
-        elapsed = ((t_ns - stamps[3]) * 1e-09)
-    stamps[3] = t_ns
+    if (stamps[4] != (<int64_t>-4611686018427387904)):
+        elapsed = ((t_ns - stamps[4]) * 1e-09)
+    stamps[4] = t_ns
     blurred = (1 - portable_exp(((-elapsed) / 20.0)))
     for i in range(4):
         memory[(14 + i)] = (memory[(4 + i)] + (blurred * (PRIOR[i] - memory[(4 + i)])))

@@ -6,15 +6,17 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
-from fusiond.events import GnssVelocity, Measurement
-from fusiond.filter.heading_bank import collapse_if_close, normalise, weigh
+from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
+from fusiond.filter.heading_bank import collapse_if_close, fuse_measurement, normalise, weigh
 from fusiond.filter.observations.model import Observation
 from fusiond.filter.parameters import make_parameters
-from fusiond.filter.state import BLOWN, CHOOSING, HYPOTHESES, PHASE, RUNNING, FilterState, T
-from fusiond.maths.wgs84 import mat_ne
+from fusiond.filter.state import BLOWN, CHOOSING, HYPOTHESES, PHASE, RESETS, RUNNING, VELOCITY, FilterState, T
+from fusiond.maths.wgs84 import geodetic, mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.streams import PULLS_AWAY_S, SECOND, T0, Drive, bits, config, drive, fuse, measurements, ramp
 
@@ -56,6 +58,86 @@ def test_in_reverse_with_wheels_that_do_not_tell(seed: int) -> None:
     error, sigma = yaw_error(fuse(config(), measurements(truth, seed=seed + 1), True), truth)
     assert abs(error) < math.radians(5.0)
     assert abs(error) < 3 * sigma
+
+
+ARM = (0.5, 0.0, -0.2)  # m, of the antenna of a robot
+
+
+def turning(heading: float) -> Drive:
+    """A robot that stands for 3 s and then turns on the spot, once around in 8 s."""
+    return drive(12.0, lambda t: 0 * t, lambda t: heading + 2 * math.pi * ramp(t, PULLS_AWAY_S, 8.0), rate=50.0)
+
+
+def robot(sigma: float) -> Config:
+    """With a wheel at either side, and a receiver of a sigma [m] that gives no velocity."""
+    gnss = {"lever_arm_m": ARM, "position_sigma_m": sigma, "height_sigma_m": sigma, "use_velocity": False}
+    whole = config(("left", "right"), gnss=gnss, wheel={"unsigned": False, "least_mps": 0.02})
+    sides = {"left": (0.0, -0.3, 0.3), "right": (0.0, 0.3, 0.3)}
+    return replace(whole, wheel={name: replace(whole.wheel[name], position_m=side) for name, side in sides.items()})
+
+
+def on_the_spot(truth: Drive, sigma: float, seed: int) -> list[Measurement]:
+    """What such a robot measures."""
+    rng, events = np.random.default_rng(seed), []
+    for event in measurements(truth, (), seed=seed):
+        k = truth.at((event.t_ns - T0) / SECOND)
+        if isinstance(event.payload, ImuSample):
+            events.append(event)
+            for sequence, (name, side) in enumerate((("left", -0.3), ("right", 0.3))):
+                speed = -float(truth.rate_b[k][2]) * side
+                reading = WheelSpeed(speed + 0.02 * rng.normal() if abs(speed) > 0.02 else 0.0)
+                events.append(Measurement(event.t_ns + sequence + 1, name, event.sequence, event.t_receive_ns, reading))
+        elif isinstance(event.payload, GnssPosition):
+            off = truth.mat_eb[k] @ ARM + rng.normal(0.0, sigma, 3)
+            fix = GnssPosition(*geodetic(truth.position_e[k] + off), sigma, sigma)
+            events.append(Measurement(event.t_ns, event.source, event.sequence, event.t_receive_ns, fix))
+    return events
+
+
+@needs_compiled
+@pytest.mark.parametrize("seed", range(5))
+def test_turning_on_the_spot_tells_the_heading_by_an_antenna_off_centre(seed: int) -> None:
+    truth = turning(1.0 + seed)
+    error, sigma = yaw_error(fuse(robot(0.02), on_the_spot(truth, 0.02, seed), True), truth)
+    assert abs(error) < 3 * sigma < math.radians(6.0)
+
+
+@needs_compiled
+def test_a_circle_below_the_noise_tells_nothing() -> None:
+    """The antenna goes around half a metre, and fixes are off by 1.5 m: there is no state, rather than a wrong one."""
+    fusion = fuse(robot(1.5), on_the_spot(turning(2.0), 1.5, 1), True)
+    assert fusion.history.head.stamps[PHASE] == CHOOSING
+
+
+@needs_compiled
+def test_a_quiet_drive_is_no_standstill() -> None:
+    """Without a wheel or a velocity a smooth road looks like rest: nothing that holds the vehicle still is to be used."""
+    truth = drive(25.0, lambda t: 10.0 + 3.0 * ramp(t, 10.0, 10.0), lambda t: 0.5 + 0.3 * ramp(t, 12.0, 8.0), rate=50.0)
+    smooth = [event for event in measurements(truth, (), seed=None) if not isinstance(event.payload, GnssVelocity)]
+    fusion = fuse(config(()), smooth, True)
+    error, _ = yaw_error(fusion, truth)
+    assert abs(error) < math.radians(3.0)
+    assert fusion.history.head.stamps[RESETS] == 0
+
+
+def test_wheels_wait_for_the_velocity(compiled: bool) -> None:
+    """At a guess of the velocity a wheel would tell of the heading what nobody knows: it weighs nothing, and changes
+    nothing, until fixes have told it."""
+    truth = departing(0.3, seconds=5.0)
+    events = [event for event in measurements(truth) if not isinstance(event.payload, GnssVelocity | WheelSpeed)]
+    fusion = fuse(config(), events, compiled)
+    head, params = fusion.history.head, fusion.params
+    assert head.stamps[PHASE] == CHOOSING
+    source = params.sources.index("rear_left")
+    values, parameter = np.array([4.0, 0.05**2, 0.0]), params.model_parameters[source]
+    before = head.bank.copy()
+    fuse_measurement(head, 0, params.models[source], values, parameter, 1.0, params)
+    np.testing.assert_array_equal(head.bank, before)
+    for i in range(HYPOTHESES):
+        head.hypothesis(i).covariance[VELOCITY, :] = 0.0
+        head.hypothesis(i).covariance[:, VELOCITY] = 0.0
+    fuse_measurement(head, 0, params.models[source], values, parameter, 1.0, params)
+    assert head.bank[0, 0] < before[0, 0]
 
 
 @pytest.mark.parametrize("column", [0, 1, -1], ids=["weight", "position", "variance"])

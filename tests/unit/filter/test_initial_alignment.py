@@ -11,28 +11,35 @@ import pytest
 from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
+from fusiond.filter.heading_bank import BANK_SIGMA
+from fusiond.filter.hot_start import Heading as StoredHeading
+from fusiond.filter.initial_alignment import _all_round, _weight_of
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
     ALIGNING,
+    ATTITUDE,
     BLOWN,
     CHOOSING,
     GYRO_BIAS,
     GYRO_BIAS_B,
     PHASE,
+    POSITION,
     POSITION_E,
     QUATERNION_EB,
+    RATE_B,
     RESET_REASON,
     RESETS,
     RUNNING,
     T_START,
+    VELOCITY,
     VELOCITY_E,
     ResetReason,
     T,
 )
 from fusiond.filter.step import LOST_HEADING, yaw_variance
-from fusiond.maths.rotation import euler, matrix, matrix_from_euler
+from fusiond.maths.rotation import euler, matrix, matrix_from_euler, skew
 from tests.conftest import needs_compiled
-from tests.helpers.streams import MS, SECOND, T0, Drive, bits, config, drive, fuse, measurements
+from tests.helpers.streams import MS, SECOND, T0, WHEELS, Drive, bits, config, drive, fuse, measurements
 
 HEADING = 0.4  # rad
 GIVEN = {"heading_deg": math.degrees(HEADING), "heading_sigma_deg": 2.0}
@@ -83,7 +90,9 @@ def test_at_rest_with_a_given_heading(compiled: bool) -> None:
     np.testing.assert_allclose(antenna, truth.position_e[0], atol=1e-6)
     np.testing.assert_allclose(head.nominal[VELOCITY_E], 0.0, atol=1e-4)
     sigma = np.sqrt(np.diag(head.covariance))
-    assert np.linalg.norm(sigma[0:3]) == pytest.approx(math.sqrt(1.5**2 + 1.5**2 + 3.0**2))
+    mat_nb = matrix_from_euler(math.radians(5), math.radians(-3), HEADING)
+    arm = skew(mat_nb @ (0.5, 0.0, -1.0)) * np.radians([3.0, 3.0, 2.0])  # what the attitude makes of the antenna's
+    assert np.linalg.norm(sigma[0:3]) == pytest.approx(math.sqrt(1.5**2 + 1.5**2 + 3.0**2 + np.sum(arm**2)))
     assert sigma[3:6].max() < 0.1  # it stands
     assert np.linalg.norm(sigma[6:9]) == pytest.approx(math.radians(math.sqrt(3.0**2 + 3.0**2 + 2.0**2)))
 
@@ -134,6 +143,128 @@ def test_given_heading_on_a_smooth_road_without_wheels(compiled: bool) -> None:
     fusion = fuse(config((), filter=GIVEN), measurements(straight(6.0, 20.0), (), seed=None), compiled)
     assert fusion.totals()["REJECTED"] == 0
     assert np.linalg.norm(fusion.history.head.nominal[VELOCITY_E]) == pytest.approx(20.0, abs=0.1)
+
+
+def without_velocity(events: list[Measurement]) -> list[Measurement]:
+    return [event for event in events if not isinstance(event.payload, GnssVelocity)]
+
+
+def test_fixes_without_a_velocity_start_a_bank(compiled: bool) -> None:
+    """As soon as it is clear that no velocity is to come: 3 s after the first fix."""
+    truth = straight(5.0, 12.0)
+    fusion = Fusion(config(), compiled)
+    for event in without_velocity(measurements(truth)):
+        fusion.fuse(event)
+        if fusion.history.head.stamps[PHASE] == CHOOSING:
+            break
+    head = fusion.history.head
+    assert float(head.stamps[T_START] - T0) / SECOND == pytest.approx(3.06)
+    first = head.hypothesis(0)
+    assert np.sqrt(np.diag(first.covariance)[VELOCITY]) == pytest.approx(20.0)  # a third of v_max_mps
+    own = math.hypot(math.radians(3.0), 1.0 / 9.78)  # of the level: what half a second's acceleration makes of gravity
+    attitude_sigma = np.sqrt(np.trace(first.covariance[ATTITUDE, ATTITUDE]))
+    assert attitude_sigma == pytest.approx(math.hypot(own, own, BANK_SIGMA), rel=1e-3)
+
+
+def test_a_velocity_that_comes_is_waited_for(compiled: bool) -> None:
+    """However slow it is, a start from it is better than one from the fixes."""
+    truth = straight(4.0, 4.5)
+    fusion = fuse(config(), [event for event in measurements(truth) if event.t_ns < T0 + SECOND], compiled)
+    assert fusion.history.head.stamps[PHASE] == ALIGNING
+    fusion = fuse(config(), measurements(truth), compiled)
+    assert float(fusion.history.head.stamps[T_START] - T0) / SECOND == pytest.approx(1.06)
+
+
+@needs_compiled
+@pytest.mark.parametrize("wheels", [WHEELS, ()], ids=["wheels", "no wheels"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_fixes_alone_tell_the_heading(seed: int, wheels: tuple[str, ...]) -> None:
+    truth = drive(30.0, lambda t: 8.0 + 2.0 * np.sin(0.6 * t), lambda t: seed + 0.5 * np.sin(0.3 * t), rate=50.0)
+    fusion = fuse(config(wheels), without_velocity(measurements(truth, wheels, seed=seed)), True)
+    off = attitude(fusion)[2] - math.degrees(seed + 0.5 * math.sin(0.3 * 30.0))
+    assert abs((off + 180) % 360 - 180) < 3.0
+    head = fusion.history.head
+    assert head.stamps[RESETS] == 0
+    np.testing.assert_allclose(head.nominal[VELOCITY_E], truth.velocity_e[-1], atol=0.5)
+
+
+VAGUE = 60.0  # deg
+
+
+@needs_compiled
+@pytest.mark.parametrize("speed", [3.0, 12.0])
+@pytest.mark.parametrize("sigma_deg", [9.0, 20.0, VAGUE, 1000.0])
+@pytest.mark.parametrize("sigmas", [0, 1, -2])
+def test_a_vague_heading_is_a_prior(sigmas: int, sigma_deg: float, speed: float) -> None:
+    """Right or two sigmas off, it ends where a start without one ends."""
+    truth = drive(12.0, lambda t: speed + 0.8 * np.sin(t), lambda t: HEADING + 0.1 * t, rate=50.0)
+    given = (math.degrees(HEADING) + sigmas * sigma_deg) % 360
+    fusion = fuse(config(filter={"heading_deg": given, "heading_sigma_deg": sigma_deg}), measurements(truth), True)
+    assert attitude(fusion)[2] == pytest.approx(math.degrees(HEADING + 1.2), abs=2.0)
+    assert fusion.history.head.stamps[RESETS] == 0
+
+
+@needs_compiled
+@pytest.mark.parametrize("sigma_deg", [2.0, 25.0])
+def test_a_heading_that_the_course_contradicts_loses(sigma_deg: float) -> None:
+    truth = drive(8.0, lambda t: 14.0 + 0 * t, lambda t: HEADING + 0.1 * t, rate=50.0)
+    wrong = {"heading_deg": math.degrees(HEADING) - 140.0, "heading_sigma_deg": sigma_deg}
+    fusion = fuse(config(filter=wrong), measurements(truth), True)
+    assert attitude(fusion)[2] == pytest.approx(math.degrees(HEADING + 0.8), abs=2.0)
+    assert fusion.history.head.stamps[RESETS] == 0
+
+
+@needs_compiled
+def test_a_heading_that_the_course_contradicts_wins_in_reverse() -> None:
+    """Backwards at the speed of a course: what the body feels decides for the given heading."""
+    truth = drive(10.0, lambda t: -10.0 - 2.0 * np.sin(t), lambda t: HEADING + 0.1 * t, rate=50.0)
+    fusion = fuse(config(filter=GIVEN), measurements(truth), True)
+    assert attitude(fusion)[2] == pytest.approx(math.degrees(HEADING + 1.0), abs=2.0)
+
+
+@pytest.mark.parametrize("sigma_deg", [9.0, 15.0, 24.0, 40.0, 1e5])
+def test_hypotheses_of_a_given_heading_make_up_its_distribution(sigma_deg: float) -> None:
+    sigma = math.radians(sigma_deg)
+    found = _all_round((1.0, sigma), 0.75).values()
+    weights, turns = np.array([weight for _, weight in found]), np.array([yaw - 1.0 for (yaw, _), _ in found])
+    own = np.array([one for (_, one), _ in found])
+    assert weights.sum() == pytest.approx(0.75)
+    assert set(own) == {min(sigma / 2, BANK_SIGMA)}
+    if sigma_deg < 45:
+        shares = weights / 0.75
+        assert shares @ turns == pytest.approx(0.0, abs=1e-3)
+        assert math.sqrt(shares @ (turns**2 + own**2)) == pytest.approx(sigma, rel=0.02)
+    else:
+        np.testing.assert_allclose(weights, 0.75 / 12, rtol=1e-4)
+
+
+def test_a_stored_and_a_given_heading_are_weighed_by_bayes() -> None:
+    stored = StoredHeading(0.5, 0.1, 0.8)
+    assert _weight_of(stored, None) == 0.8
+    assert _weight_of(stored, (2.0, 1e6)) == pytest.approx(0.8, abs=1e-6)
+    spread = 0.1**2 + 0.5**2
+    for off in (0.0, 0.7, math.pi):
+        likelihood = sum(math.exp(-((off + 2 * math.pi * k) ** 2) / (2 * spread)) for k in (-1, 0, 1))
+        likelihood *= math.sqrt(2 * math.pi / spread)  # over that of a heading from anywhere, 1 / (2 pi)
+        assert _weight_of(stored, (0.5 + off, 0.5)) == pytest.approx(0.8 * likelihood / (0.8 * likelihood + 0.2), rel=1e-9)
+
+
+def test_the_arm_ties_position_and_velocity_to_the_attitude(compiled: bool) -> None:
+    """The antenna is known as the fix is, however little is known of where the body is around it."""
+    arm, turning = (1.5, 0.5, -1.0), drive(3.0, lambda t: 10.0 + 0 * t, lambda t: HEADING + 0.4 * t, rate=50.0)
+    fusion = Fusion(config(gnss={"lever_arm_m": arm}), compiled)
+    start(fusion, measurements(turning))
+    head = fusion.history.head
+    rotation, p = matrix(head.nominal[QUATERNION_EB]), head.covariance
+    swing = np.cross(head.auxiliary[RATE_B] - head.nominal[GYRO_BIAS_B], arm)
+    for block, offset, sigmas in ((POSITION, arm, (1.5, 1.5, 3.0)), (VELOCITY, swing, (0.2, 0.2, 0.2))):
+        h = np.zeros((3, len(p)))
+        h[:, block], h[:, ATTITUDE] = np.eye(3), -skew(rotation @ offset)
+        assert np.sqrt(np.trace(h @ p @ h.T)) == pytest.approx(np.linalg.norm(sigmas), rel=1e-3)
+        assert np.trace(p[block, block]) > np.sum(np.square(sigmas))
+    assert np.linalg.eigvalsh(p).min() > -1e-12
+    antenna_e = head.nominal[VELOCITY_E] + rotation @ swing
+    np.testing.assert_allclose(antenna_e, turning.velocity_e[turning.at(1.06)], atol=0.5)  # as measured there, with no arm
 
 
 def test_gyro_bias_of_a_standstill(compiled: bool) -> None:
