@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import chain, islice
-from operator import itemgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
+
+from msgspec.structs import replace
 
 from fusiond.config.schema import Config
-from fusiond.events import Received
+from fusiond.events import STEP_BACK_NS, Received
 from fusiond.units import SECOND
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
+REACH_NS = 60 * SECOND  # the logs of one host step back within this of each other, but for longer holes in them
 
 Item = TypeVar("Item")
 
@@ -38,8 +41,11 @@ def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
 class LogSet:
     """The logs of one drive; iterating, once, yields their events merged by `t_receive_ns`.
 
-    Each log keeps its own order. If its stamps run back, an event counts as received with the latest one before it: nothing
-    is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
+    Each log keeps its own order. If its stamps run back by up to a second, an event counts as received with the latest one
+    before it: nothing is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
+    If they step back further, a new session begins: the clock of the recording host was set back, or another drive follows
+    in the file. All logs enter it together, after everything of the old session: each at its own step if that is near, else
+    where it is, for then it was recorded by another host's clock. A lone stamp far off counts as the latest before it.
     Iterating raises LogError if a file is not a log.
     """
 
@@ -51,9 +57,34 @@ class LogSet:
         if self._begun:
             raise RuntimeError("a LogSet is read once")
         self._begun = True
-        placed = (log.placed() for log in self._logs)
-        frames = map(itemgetter(1), heapq.merge(*placed, key=itemgetter(0)))
-        return _ahead(chain.from_iterable(frames))
+        return _ahead(chain.from_iterable(self._merged()))
+
+    def _merged(self) -> Iterator[list[Received]]:
+        """The events of each frame, session by session."""
+        logs = self._logs
+        heads = [(frame.t_ns, number) for number, log in enumerate(logs) if (frame := log.next_frame()) is not None]
+        while heads:
+            heapq.heapify(heads)
+            following: list[tuple[int, int]] = []  # heads that belong to the next session
+            over = False  # a log has stepped back
+            while heads:
+                t_ns, number = heads[0]
+                yield logs[number].take()
+                frame = logs[number].next_frame()
+                if frame is None:
+                    heapq.heappop(heads)
+                elif not frame.steps_back:
+                    heapq.heapreplace(heads, (frame.t_ns, number))
+                else:
+                    heapq.heappop(heads)
+                    following.append((frame.t_ns, number))
+                    if not over:
+                        over = True
+                        late = [head for head in heads if not logs[head[1]].ends_session_before(t_ns + REACH_NS)]
+                        following += late
+                        heads = [head for head in heads if head not in late]
+                        heapq.heapify(heads)
+            heads = following
 
     @property
     def bytes_total(self) -> int:
@@ -91,6 +122,14 @@ def _ahead(items: Iterator[Item]) -> Iterator[Item]:
         yield from some
 
 
+class _Frame(NamedTuple):
+    """The events of a frame, with the latest receive stamp of the session so far."""
+
+    t_ns: int
+    steps_back: bool  # it begins a new session
+    events: list[Received]
+
+
 class _Log:
     """One log, its decoders, and the stamps seen in it."""
 
@@ -101,23 +140,57 @@ class _Log:
         self.last_ns = 0
         self.is_empty = False  # read to its end without an event
         self._reading = reading
+        self._placed = self._place()
+        self._ahead: deque[_Frame] = deque()  # read, but not taken
 
-    def placed(self) -> Iterator[tuple[int, list[Received]]]:
-        """The events of each frame, with the latest receive stamp so far."""
+    def next_frame(self) -> _Frame | None:
+        """The next frame; None at the end."""
+        if not self._ahead:
+            frame = next(self._placed, None)
+            if frame is None:
+                return None
+            self._ahead.append(frame)
+        return self._ahead[0]
+
+    def take(self) -> list[Received]:
+        """The events of the next frame, which is then over."""
+        return self._ahead.popleft().events
+
+    def ends_session_before(self, until_ns: int) -> bool:
+        """Whether the log ends, or steps back after its next frame, before a stamp. It is read up to there."""
+        if any(frame.steps_back for frame in islice(self._ahead, 1, None)):
+            return True
+        while not self._ahead or self._ahead[-1].t_ns < until_ns:
+            frame = next(self._placed, None)
+            if frame is None:
+                return True
+            self._ahead.append(frame)
+            if frame.steps_back:
+                return True
+        return False
+
+    def _place(self) -> Iterator[_Frame]:
+        frames = filter(None, self._reading.frames)
+        events = next(frames, None)
+        self.is_empty = events is None
         latest_ns: int | None = None
-        for events in self._reading.frames:
-            if not events:
-                continue
-            t_ns = events[0].t_receive_ns
+        while events is not None:
+            t_ns, following, steps_back = events[0].t_receive_ns, next(frames, None), False
             if latest_ns is None or self.first_ns is None:
                 latest_ns = self.first_ns = self.last_ns = t_ns
+            elif abs(t_ns - latest_ns) > STEP_BACK_NS and _is_alone(latest_ns, t_ns, following):
+                self.file.counts["bad stamps"] += len(events)
+                events = [replace(event, t_receive_ns=latest_ns) for event in events]
             elif t_ns >= latest_ns:
-                latest_ns = self.last_ns = t_ns
+                latest_ns = t_ns
+                self.last_ns = max(self.last_ns, t_ns)
             else:
+                steps_back = t_ns < latest_ns - STEP_BACK_NS
+                self.file.counts["steps back" if steps_back else "stamps run back"] += 1 if steps_back else len(events)
                 self.first_ns = min(self.first_ns, t_ns)
-                self.file.counts["stamps run back"] += len(events)
-            yield latest_ns, events
-        self.is_empty = latest_ns is None
+                latest_ns = t_ns if steps_back else latest_ns
+            yield _Frame(latest_ns, steps_back, events)
+            events = following
         self.file.bytes_read = self.file.bytes_total
 
     def counts(self) -> dict[str, int]:
@@ -134,6 +207,14 @@ class _Log:
     def span(self) -> str:
         first, last = (_readable(t_ns) for t_ns in (self.first_ns or 0, self.last_ns))
         return f"{self.file.path} from {first} to {last}"
+
+
+def _is_alone(before_ns: int, t_ns: int, following: list[Received] | None) -> bool:
+    """Whether a stamp far from the one before it is wrong: the one that follows is nearer to that, or none does."""
+    if following is None:
+        return t_ns < before_ns
+    following_ns = following[0].t_receive_ns
+    return abs(following_ns - t_ns) > abs(following_ns - before_ns)
 
 
 def _readable(t_ns: int) -> str:

@@ -106,6 +106,12 @@ class Fusion:
             return Receipt(measurement, history, history.count(source, Outcome.INVALID), reason)
         return Receipt(measurement, history, history.offer(source, measurement, values))
 
+    def begin_session(self) -> None:
+        """Begin anew on a time line that has stepped back: nothing of the old one, no alignment of a clock, is of use. The
+        state aligns again; biases, calibrations and counts are kept."""
+        self.clock.forget()
+        self.history = self.history.next_session()
+
     def solution_at(self, t_ns: int) -> Solution:
         """The solution at an instant, from everything received so far: the head, predicted to the instant with the newest
         IMU sample. An instant before the head's gives the head itself."""

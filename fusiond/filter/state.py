@@ -139,6 +139,7 @@ class ResetReason(IntEnum):
     NOT_FINITE = 3  # a number was no longer finite: it aligns again
     SOURCE_RETURNED = 4  # a source that was rejected all the time with the same error was taken as right
     HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored one
+    TIME_STEPPED_BACK = 6  # receipt stamps stepped back, a new session: it aligns again
 
 
 class Verdict(IntEnum):

@@ -126,6 +126,11 @@ class Aligner:
         self._unix = unix
         self._pieces: deque[_Piece] = deque(maxlen=PIECES)
 
+    def forget(self) -> None:
+        """Forget all but the counts; the next stamp is like the first."""
+        self.complaint = ""
+        self._pieces.clear()
+
     def _begin(self, stamp: int, receive: int, offset: int) -> None:
         """Forget everything; from here on, receipt less stamp is `offset` or more."""
         self._floor = OffsetFloor(receive, offset)

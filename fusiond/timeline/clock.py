@@ -42,6 +42,11 @@ class Clock:
                 payload = Invalid(placed)
         return Measurement(t_ns - self._delays.get(source, 0), source, received.sequence, receive, payload)
 
+    def forget(self) -> None:
+        """Forget every alignment, but not the counts: the time line has stepped back."""
+        for aligner in self._aligners.values():
+            aligner.forget()
+
     def report(self) -> dict[str, ClockReport]:
         """How each clock is aligned, by name; "arrival" is for events without a stamp."""
         reports = {name: aligner.report() for name, aligner in sorted(self._aligners.items()) if aligner.samples}

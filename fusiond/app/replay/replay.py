@@ -18,6 +18,7 @@ from fusiond.app.replay.summary import (
     Publications,
     SourceReport,
     Span,
+    StepBack,
     Summary,
     source_report,
 )
@@ -102,8 +103,8 @@ class Replay:
         return self.engine.elapsed_ns
 
     def _is_withheld(self, event: Received) -> bool:
-        first_ns = event.t_receive_ns if self.first_ns is None else self.first_ns
-        since_ns = max(event.t_receive_ns, self.engine.now_ns) - first_ns
+        engine = self.engine
+        since_ns = max(event.t_receive_ns, engine.now_ns) - engine.origin_ns if engine.first_ns is not None else 0
         return any(
             event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._task.withheld
         )
@@ -125,8 +126,7 @@ class Replay:
             sink(message)
 
     def _add_state(self, state: StateMessage) -> None:
-        assert self.first_ns is not None
-        since_start_ns = state.t_ns - self.first_ns
+        since_start_ns = state.t_ns - self.engine.origin_ns
         errors = errors_of(state, self._task.truth.at(state.t_ns)) if self._task.truth else None
         self._modes[state.mode.value] += 1
         self._reckoning.add(since_start_ns, state, errors)
@@ -149,6 +149,7 @@ class Replay:
             vehicle=self.config.vehicle.name,
             logs=logs,
             warnings=warnings,
+            steps_back=[StepBack(at_s=one.since_ns / SECOND, by_s=one.by_ns / SECOND) for one in engine.steps_back],
             span=Span(first_ns=engine.first_ns, last_ns=engine.now_ns, seconds=self.elapsed_ns / SECOND),
             events=self.events,
             clock_pairs=self.clock_pairs,

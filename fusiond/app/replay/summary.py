@@ -19,6 +19,7 @@ from fusiond.units import MILLISECOND, SECOND
 
 LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # width and limit of the histogram's bins
 BATCH = 1024  # latencies added to the histogram together
+MAX_STEPS = 5  # steps back that the text lists
 MAX_STRETCHES = 50  # stretches of dead reckoning that are listed
 
 
@@ -48,11 +49,18 @@ class SourceReport(Struct, frozen=True, kw_only=True):
 
 
 class Span(Struct, frozen=True, kw_only=True):
-    """From the receipt of the first event to that of the last."""
+    """From the receipt of the first event to that of the last. `seconds` leaves out what the stamps stepped back."""
 
     first_ns: int
     last_ns: int
     seconds: float
+
+
+class StepBack(Struct, frozen=True, kw_only=True):
+    """Where the receipt stamps step back, and a new session begins."""
+
+    at_s: float  # from the first event
+    by_s: float
 
 
 class Publications(Struct, frozen=True, kw_only=True):
@@ -91,6 +99,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     logs: dict[str, dict[str, int]]  # counts of the readers, by file name
     warnings: list[str]
     span: Span
+    steps_back: list[StepBack] = []
     events: int
     clock_pairs: int  # events that are only for the clock
     rerun: int  # events run again because another was late
@@ -217,6 +226,13 @@ def _lines(summary: Summary) -> Iterator[str]:
     yield f"{summary.vehicle}: {span.seconds:.1f} s from {first:%Y-%m-%d %H:%M:%S} UTC out of {logs}"
     for warning in summary.warnings:
         yield f"warning: {warning}"
+    for step in summary.steps_back[:MAX_STEPS]:
+        yield (
+            f"warning: at {step.at_s:.1f} s the receipt stamps step back by {step.by_s:.1f} s: a new session begins there,"
+            " with clocks and state aligned again"
+        )
+    if len(summary.steps_back) > MAX_STEPS:
+        yield f"warning: and {len(summary.steps_back) - MAX_STEPS} more times"
     yield ""
     yield from _source_table(summary.sources)
     yield from _remarks(summary)
