@@ -3,10 +3,9 @@
 The caller gives the engine events in order of receipt; live, it also calls `elapse` while no event comes. All messages to
 publish are handed to one sink, in order.
 
-A receipt more than a second before the latest begins a new session: the clock of the host was set back, or the log of
-another drive follows. The ticks of the old session are finished, and the fusion begins anew on the new time line. Time
-since the first event goes on: only the time line has moved. An earlier receipt within that second counts as simultaneous
-with the latest.
+Where receipts step back (`fusiond.sessions`), the clock of the host was set back, or another drive follows in the log. The
+ticks of the old session are finished, and the fusion begins anew on the new time line. Time since the first event goes on.
+Any other receipt that is earlier than the latest counts as simultaneous with it.
 
 Tick k is k periods after the receipt of the first event. It is made after all events received up to it and before any
 received later, so its messages depend only on the events and their receive stamps. With `publish.on_imu` a tick waits for
@@ -24,7 +23,7 @@ from typing import NamedTuple
 
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion, Receipt
-from fusiond.events import STEP_BACK_NS, ImuSample, Received
+from fusiond.events import ImuSample, Received
 from fusiond.filter.stored_state import StoredState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.outcomes import totals
@@ -99,6 +98,8 @@ class Engine:
 
     def feed(self, event: Received) -> Receipt | None:
         """Advance to an event's receipt, fuse it, and publish what is due. None if the event was for the clock only."""
+        if self.fusion.clock.steps_back(event):
+            self._begin_session(event.t_receive_ns)
         self.advance(event.t_receive_ns)
         receipt = self.fusion.feed(event)
         if receipt is not None:
@@ -109,12 +110,10 @@ class Engine:
         return receipt
 
     def advance(self, t_receive_ns: int) -> None:
-        """Make the ticks before a receipt; begin a new session with it if it steps back."""
+        """Make the ticks before a receipt. A receipt earlier than the latest counts as simultaneous with it."""
         if self.first_ns is None:
             self.first_ns = self.origin_ns = self.now_ns = t_receive_ns
-        if t_receive_ns < self.now_ns - STEP_BACK_NS:
-            self._begin_session(t_receive_ns)
-        elif t_receive_ns > self.now_ns:
+        if t_receive_ns > self.now_ns:
             self._make_ticks_before(t_receive_ns)
             self.now_ns = t_receive_ns
         self._prepared = None

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from fusiond.units import SECOND
-
 Vector3 = tuple[float, float, float]
 
 
@@ -113,8 +111,6 @@ class Measurement(Struct, frozen=True, gc=False):
     def key(self) -> tuple[int, str, int]:
         return self.t_ns, self.source, self.sequence
 
-
-STEP_BACK_NS = SECOND  # a receipt more than this before the latest one shows a step back of the host's clock, not disorder
 
 UNIX_CLOCK = "unix"
 HOST_CLOCK = "host"  # the clock of the receive stamps

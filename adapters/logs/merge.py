@@ -13,13 +13,15 @@ from typing import NamedTuple, TypeVar
 from msgspec.structs import replace
 
 from fusiond.config.schema import Config
-from fusiond.events import STEP_BACK_NS, Received
+from fusiond.events import Received
+from fusiond.sessions import Receipts
 from fusiond.units import SECOND
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
+FAR_NS = SECOND  # a stamp that is further than this after the one before it may be a wrong one
 REACH_NS = 60 * SECOND  # the logs of one host step back within this of each other, but for longer holes in them
 
 Item = TypeVar("Item")
@@ -41,11 +43,11 @@ def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
 class LogSet:
     """The logs of one drive; iterating, once, yields their events merged by `t_receive_ns`.
 
-    Each log keeps its own order. If its stamps run back by up to a second, an event counts as received with the latest one
-    before it: nothing is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
-    If they step back further, a new session begins: the clock of the recording host was set back, or another drive follows
-    in the file. All logs enter it together, after everything of the old session: each at its own step if that is near, else
-    where it is, for then it was recorded by another host's clock. A lone stamp far off counts as the latest before it.
+    Each log keeps its own order. If its stamps run back, an event counts as received with the latest one before it: nothing
+    is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
+    Where those of one source step back (`fusiond.sessions`), a new session begins. All logs enter it together, after all of
+    the old one: each at its own step if that is near, else where it is, for then another host's clock has stamped it. A lone
+    stamp that is far off is replaced by the one before it.
     Iterating raises LogError if a file is not a log.
     """
 
@@ -174,21 +176,27 @@ class _Log:
         events = next(frames, None)
         self.is_empty = events is None
         latest_ns: int | None = None
+        receipts = Receipts()
         while events is not None:
-            t_ns, following, steps_back = events[0].t_receive_ns, next(frames, None), False
+            t_ns, following = events[0].t_receive_ns, next(frames, None)
+            steps_back = receipts.steps_back(events[0].source, t_ns)
             if latest_ns is None or self.first_ns is None:
                 latest_ns = self.first_ns = self.last_ns = t_ns
-            elif abs(t_ns - latest_ns) > STEP_BACK_NS and _is_alone(latest_ns, t_ns, following):
+            elif (steps_back or t_ns > latest_ns + FAR_NS) and _is_alone(latest_ns, t_ns, following):
+                steps_back = False
                 self.file.counts["bad stamps"] += len(events)
                 events = [replace(event, t_receive_ns=latest_ns) for event in events]
+            elif steps_back:
+                receipts.clear()
+                self.file.counts["steps back"] += 1
+                latest_ns, self.first_ns = t_ns, min(self.first_ns, t_ns)
             elif t_ns >= latest_ns:
-                latest_ns = t_ns
-                self.last_ns = max(self.last_ns, t_ns)
+                latest_ns, self.last_ns = t_ns, max(self.last_ns, t_ns)
             else:
-                steps_back = t_ns < latest_ns - STEP_BACK_NS
-                self.file.counts["steps back" if steps_back else "stamps run back"] += 1 if steps_back else len(events)
                 self.first_ns = min(self.first_ns, t_ns)
-                latest_ns = t_ns if steps_back else latest_ns
+                self.file.counts["stamps run back"] += len(events)
+            for event in events:
+                receipts.add(event.source, event.t_receive_ns)
             yield _Frame(latest_ns, steps_back, events)
             events = following
         self.file.bytes_read = self.file.bytes_total
