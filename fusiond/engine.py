@@ -98,7 +98,7 @@ class Engine:
 
     def feed(self, event: Received) -> Receipt | None:
         """Advance to an event's receipt, fuse it, and publish what is due. None if the event was for the clock only."""
-        if self.fusion.clock.steps_back(event):
+        if event.t_receive_ns < self.now_ns and self.fusion.clock.steps_back(event):
             self._begin_session(event.t_receive_ns)
         self.advance(event.t_receive_ns)
         receipt = self.fusion.feed(event)

@@ -23,6 +23,8 @@ class Receipts:
 
     def steps_back(self, source: str, t_receive_ns: int) -> bool:
         """Whether a receipt shows that the stamps have stepped back: that it begins a new session."""
+        if t_receive_ns >= self._latest:
+            return False
         last = self._last.get(source)
         if last is None:
             return t_receive_ns < self._latest - DISORDER_NS

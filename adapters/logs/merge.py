@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from msgspec.structs import replace
 
@@ -25,6 +25,8 @@ FAR_NS = SECOND  # a stamp that is further than this after the one before it may
 REACH_NS = 60 * SECOND  # the logs of one host step back within this of each other, but for longer holes in them
 
 Item = TypeVar("Item")
+_Frame = tuple[int, bool, list[Received]]  # latest stamp so far; whether it begins a session; the events
+_Head = tuple[int, int, list[Received]]  # stamp and number of the log that the events are next in
 
 
 def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
@@ -64,29 +66,32 @@ class LogSet:
     def _merged(self) -> Iterator[list[Received]]:
         """The events of each frame, session by session."""
         logs = self._logs
-        heads = [(frame.t_ns, number) for number, log in enumerate(logs) if (frame := log.next_frame()) is not None]
+        heads = [(frame[0], number, frame[2]) for number, log in enumerate(logs) if (frame := log.next_frame())]
         while heads:
             heapq.heapify(heads)
-            following: list[tuple[int, int]] = []  # heads that belong to the next session
-            over = False  # a log has stepped back
+            following: list[_Head] = []  # those of the next session
             while heads:
-                t_ns, number = heads[0]
-                yield logs[number].take()
+                t_ns, number, events = heads[0]
+                yield events
                 frame = logs[number].next_frame()
                 if frame is None:
                     heapq.heappop(heads)
-                elif not frame.steps_back:
-                    heapq.heapreplace(heads, (frame.t_ns, number))
+                elif not frame[1]:
+                    heapq.heapreplace(heads, (frame[0], number, frame[2]))
                 else:
                     heapq.heappop(heads)
-                    following.append((frame.t_ns, number))
-                    if not over:
-                        over = True
-                        late = [head for head in heads if not logs[head[1]].ends_session_before(t_ns + REACH_NS)]
-                        following += late
-                        heads = [head for head in heads if head not in late]
-                        heapq.heapify(heads)
+                    if not following:
+                        heads, following = self._divided(heads, t_ns)
+                    following.append((frame[0], number, frame[2]))
             heads = following
+
+    def _divided(self, heads: list[_Head], t_ns: int) -> tuple[list[_Head], list[_Head]]:
+        """Where one log has stepped back after a stamp: as a heap, the heads of the logs that still belong to the session, as
+        they end or step back soon; and the other heads, which enter the next session."""
+        own = [head for head in heads if self._logs[head[1]].ends_session_before(t_ns + REACH_NS)]
+        others = [head for head in heads if head not in own]
+        heapq.heapify(own)
+        return own, others
 
     @property
     def bytes_total(self) -> int:
@@ -124,14 +129,6 @@ def _ahead(items: Iterator[Item]) -> Iterator[Item]:
         yield from some
 
 
-class _Frame(NamedTuple):
-    """The events of a frame, with the latest receive stamp of the session so far."""
-
-    t_ns: int
-    steps_back: bool  # it begins a new session
-    events: list[Received]
-
-
 class _Log:
     """One log, its decoders, and the stamps seen in it."""
 
@@ -147,58 +144,57 @@ class _Log:
 
     def next_frame(self) -> _Frame | None:
         """The next frame; None at the end."""
-        if not self._ahead:
-            frame = next(self._placed, None)
-            if frame is None:
-                return None
-            self._ahead.append(frame)
-        return self._ahead[0]
-
-    def take(self) -> list[Received]:
-        """The events of the next frame, which is then over."""
-        return self._ahead.popleft().events
+        return self._ahead.popleft() if self._ahead else next(self._placed, None)
 
     def ends_session_before(self, until_ns: int) -> bool:
-        """Whether the log ends, or steps back after its next frame, before a stamp. It is read up to there."""
-        if any(frame.steps_back for frame in islice(self._ahead, 1, None)):
-            return True
-        while not self._ahead or self._ahead[-1].t_ns < until_ns:
-            frame = next(self._placed, None)
-            if frame is None:
+        """Whether the log ends or steps back before a stamp. It is read up to there."""
+        for frame in chain(tuple(self._ahead), self._read_ahead()):
+            if frame[1]:
                 return True
+            if frame[0] > until_ns:
+                return False
+        return True
+
+    def _read_ahead(self) -> Iterator[_Frame]:
+        for frame in self._placed:
             self._ahead.append(frame)
-            if frame.steps_back:
-                return True
-        return False
+            yield frame
 
     def _place(self) -> Iterator[_Frame]:
+        """Every frame with events, its stamp put right where it alone is far off."""
         frames = filter(None, self._reading.frames)
         events = next(frames, None)
         self.is_empty = events is None
-        latest_ns: int | None = None
+        if events is None:
+            self.file.bytes_read = self.file.bytes_total
+            return
+        latest_ns = self.first_ns = self.last_ns = events[0].t_receive_ns
         receipts = Receipts()
         while events is not None:
-            t_ns, following = events[0].t_receive_ns, next(frames, None)
-            steps_back = receipts.steps_back(events[0].source, t_ns)
-            if latest_ns is None or self.first_ns is None:
-                latest_ns = self.first_ns = self.last_ns = t_ns
-            elif (steps_back or t_ns > latest_ns + FAR_NS) and _is_alone(latest_ns, t_ns, following):
-                steps_back = False
-                self.file.counts["bad stamps"] += len(events)
-                events = [replace(event, t_receive_ns=latest_ns) for event in events]
-            elif steps_back:
-                receipts.clear()
-                self.file.counts["steps back"] += 1
-                latest_ns, self.first_ns = t_ns, min(self.first_ns, t_ns)
-            elif t_ns >= latest_ns:
-                latest_ns, self.last_ns = t_ns, max(self.last_ns, t_ns)
+            t_ns, following, steps_back = events[0].t_receive_ns, next(frames, None), False
+            if 0 <= t_ns - latest_ns <= FAR_NS:
+                latest_ns = t_ns
             else:
-                self.first_ns = min(self.first_ns, t_ns)
-                self.file.counts["stamps run back"] += len(events)
+                steps_back = receipts.steps_back(events[0].source, t_ns)
+                if (steps_back or t_ns > latest_ns) and _is_alone(latest_ns, t_ns, following):
+                    steps_back = False
+                    self.file.counts["bad stamps"] += len(events)
+                    events = [replace(event, t_receive_ns=latest_ns) for event in events]
+                elif steps_back:
+                    receipts.clear()
+                    self.file.counts["steps back"] += 1
+                    self.last_ns = max(self.last_ns, latest_ns)
+                    latest_ns = t_ns
+                elif t_ns > latest_ns:
+                    latest_ns = t_ns
+                else:
+                    self.file.counts["stamps run back"] += len(events)
+                self.first_ns = min(self.first_ns, events[0].t_receive_ns)
             for event in events:
                 receipts.add(event.source, event.t_receive_ns)
-            yield _Frame(latest_ns, steps_back, events)
+            yield latest_ns, steps_back, events
             events = following
+        self.last_ns = max(self.last_ns, latest_ns)
         self.file.bytes_read = self.file.bytes_total
 
     def counts(self) -> dict[str, int]:
@@ -218,7 +214,8 @@ class _Log:
 
 
 def _is_alone(before_ns: int, t_ns: int, following: list[Received] | None) -> bool:
-    """Whether a stamp far from the one before it is wrong: the one that follows is nearer to that, or none does."""
+    """Whether a stamp far from the one before it is wrong: the following one is nearer to that; or it falls, and is the
+    last."""
     if following is None:
         return t_ns < before_ns
     following_ns = following[0].t_receive_ns
