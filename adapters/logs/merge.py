@@ -21,7 +21,6 @@ from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
-FAR_NS = SECOND  # a stamp that is further than this after the one before it may be a wrong one
 REACH_NS = 60 * SECOND  # the logs of one host step back within this of each other, but for longer holes in them
 
 Item = TypeVar("Item")
@@ -49,7 +48,7 @@ class LogSet:
     is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
     Where those of one source step back (`fusiond.sessions`), a new session begins. All logs enter it together, after all of
     the old one: each at its own step if that is near, else where it is, for then another host's clock has stamped it. A lone
-    stamp that is far off is replaced by the one before it.
+    stamp behind counts as the latest before it.
     Iterating raises LogError if a file is not a log.
     """
 
@@ -86,7 +85,7 @@ class LogSet:
             heads = following
 
     def _divided(self, heads: list[_Head], t_ns: int) -> tuple[list[_Head], list[_Head]]:
-        """Where one log has stepped back after a stamp: as a heap, the heads of the logs that still belong to the session, as
+        """When a log has stepped back after a stamp: as a heap the heads of the logs that still belong to the session, as
         they end or step back soon; and the other heads, which enter the next session."""
         own = [head for head in heads if self._logs[head[1]].ends_session_before(t_ns + REACH_NS)]
         others = [head for head in heads if head not in own]
@@ -161,7 +160,7 @@ class _Log:
             yield frame
 
     def _place(self) -> Iterator[_Frame]:
-        """Every frame with events, its stamp put right where it alone is far off."""
+        """Every frame with events. One that alone steps back counts as received with the latest one before it."""
         frames = filter(None, self._reading.frames)
         events = next(frames, None)
         self.is_empty = events is None
@@ -172,24 +171,20 @@ class _Log:
         receipts = Receipts()
         while events is not None:
             t_ns, following, steps_back = events[0].t_receive_ns, next(frames, None), False
-            if 0 <= t_ns - latest_ns <= FAR_NS:
+            if t_ns >= latest_ns:
                 latest_ns = t_ns
+            elif not receipts.steps_back(events[0].source, t_ns):
+                self.first_ns = min(self.first_ns, t_ns)
+                self.file.counts["stamps run back"] += len(events)
+            elif following is None or _is_nearer(following[0].t_receive_ns, latest_ns, t_ns):
+                self.file.counts["stamps run back"] += len(events)
+                events = [replace(event, t_receive_ns=latest_ns) for event in events]
             else:
-                steps_back = receipts.steps_back(events[0].source, t_ns)
-                if (steps_back or t_ns > latest_ns) and _is_alone(latest_ns, t_ns, following):
-                    steps_back = False
-                    self.file.counts["bad stamps"] += len(events)
-                    events = [replace(event, t_receive_ns=latest_ns) for event in events]
-                elif steps_back:
-                    receipts.clear()
-                    self.file.counts["steps back"] += 1
-                    self.last_ns = max(self.last_ns, latest_ns)
-                    latest_ns = t_ns
-                elif t_ns > latest_ns:
-                    latest_ns = t_ns
-                else:
-                    self.file.counts["stamps run back"] += len(events)
-                self.first_ns = min(self.first_ns, events[0].t_receive_ns)
+                steps_back = True
+                self.file.counts["steps back"] += 1
+                receipts.clear()
+                self.first_ns, self.last_ns = min(self.first_ns, t_ns), max(self.last_ns, latest_ns)
+                latest_ns = t_ns
             for event in events:
                 receipts.add(event.source, event.t_receive_ns)
             yield latest_ns, steps_back, events
@@ -213,13 +208,8 @@ class _Log:
         return f"{self.file.path} from {first} to {last}"
 
 
-def _is_alone(before_ns: int, t_ns: int, following: list[Received] | None) -> bool:
-    """Whether a stamp far from the one before it is wrong: the following one is nearer to that; or it falls, and is the
-    last."""
-    if following is None:
-        return t_ns < before_ns
-    following_ns = following[0].t_receive_ns
-    return abs(following_ns - t_ns) > abs(following_ns - before_ns)
+def _is_nearer(t_ns: int, this_ns: int, that_ns: int) -> bool:
+    return abs(t_ns - this_ns) < abs(t_ns - that_ns)
 
 
 def _readable(t_ns: int) -> str:
