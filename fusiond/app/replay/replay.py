@@ -20,6 +20,7 @@ from fusiond.app.replay.summary import (
     Span,
     StepBack,
     Summary,
+    TooOld,
     source_report,
 )
 from fusiond.app.replay.truth import Truth
@@ -78,6 +79,7 @@ class Replay:
         self._withheld: Counter[str] = Counter()
         self._modes: Counter[str] = Counter()
         self._latencies = {source: Latencies() for source in config.sources()}
+        self._lateness: dict[str, TooOld] = {}  # by source
         self._comparison = Comparison(task.window)
         self._reckoning = DeadReckoningLog(config.filter.position_timeout_s)
 
@@ -113,11 +115,18 @@ class Replay:
         if receipt is None:
             self.clock_pairs += isinstance(event.payload, ClockPair)
             return
+        if receipt.refusal is Outcome.TOO_OLD:
+            self._note_lateness(event, receipt)
         if receipt.refusal is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)
         for sink in self._task.on_receipt:
             sink(receipt)
+
+    def _note_lateness(self, event: Received, receipt: Receipt) -> None:
+        found, measurement = self._lateness.setdefault(event.source, TooOld(clock=event.clock)), receipt.measurement
+        found.late_s = max(found.late_s, (measurement.t_receive_ns - measurement.t_ns) / SECOND)
+        found.beyond_s = max(found.beyond_s, (receipt.history.settled_ns - measurement.t_ns) / SECOND)
 
     def _receive(self, message: Message) -> None:
         if isinstance(message, StateMessage):
@@ -165,6 +174,12 @@ class Replay:
     def _sources(self) -> dict[str, SourceReport]:
         outcomes, fusion = self.fusion.outcomes(), self.fusion
         return {
-            name: source_report(self._withheld[name], outcomes[name], fusion.invalid[name], self._latencies[name].report())
+            name: source_report(
+                self._withheld[name],
+                outcomes[name],
+                fusion.invalid[name],
+                self._latencies[name].report(),
+                self._lateness.get(name),
+            )
             for name in self.config.sources()
         }

@@ -14,11 +14,12 @@ from fusiond.app.replay.comparison import Errors, TruthReport
 from fusiond.app.replay.statistics import Histogram
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
-from fusiond.timeline.aligner import ClockReport
+from fusiond.timeline.aligner import PLAUSIBLE_LATENCY, ClockReport
 from fusiond.units import MILLISECOND, SECOND
 
 LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # width and limit of the histogram's bins
 BATCH = 1024  # latencies added to the histogram together
+LONG_S = 5.0  # an event later than the horizon by more than this is not a matter of the horizon
 MAX_STEPS = 5  # steps back that the text lists
 MAX_STRETCHES = 50  # stretches of dead reckoning that are listed
 
@@ -31,6 +32,14 @@ class Latency(Struct, frozen=True, kw_only=True):
     p90: float
     p99: float
     max: float
+
+
+class TooOld(Struct, kw_only=True):
+    """How late the events of a source were that came after the horizon, at the most."""
+
+    late_s: float = 0.0  # receipt less the instant measured
+    beyond_s: float = 0.0  # by how much the horizon was too short
+    clock: str = ""  # that stamped them; empty if none did
 
 
 class SourceReport(Struct, frozen=True, kw_only=True):
@@ -46,6 +55,7 @@ class SourceReport(Struct, frozen=True, kw_only=True):
     withheld: int
     invalid_reasons: dict[str, int]
     latency_ms: Latency | None  # None if no event was usable
+    lateness: TooOld | None = None  # of those that were too old
 
 
 class Span(Struct, frozen=True, kw_only=True):
@@ -198,7 +208,11 @@ class DeadReckoningLog:
 
 
 def source_report(
-    withheld: int, outcomes: Mapping[str, int], reasons: Mapping[str, int], latency: Latency | None
+    withheld: int,
+    outcomes: Mapping[str, int],
+    reasons: Mapping[str, int],
+    latency: Latency | None,
+    lateness: TooOld | None = None,
 ) -> SourceReport:
     """`outcomes`: counts by Outcome's names."""
     counts = {name.lower(): count for name, count in outcomes.items()}
@@ -207,6 +221,7 @@ def source_report(
         withheld=withheld,
         invalid_reasons=dict(sorted(reasons.items())),
         latency_ms=latency,
+        lateness=lateness,
         **counts,
     )
 
@@ -273,7 +288,8 @@ def _remarks(summary: Summary) -> Iterator[str]:
             reasons = ", ".join(f"{reason} ({count})" for reason, count in source.invalid_reasons.items())
             yield f"  invalid of {name}: {reasons}"
         if source.too_old:
-            yield f"  {name}: {source.too_old} came later than filter.horizon_s allows; a longer horizon would use them"
+            why = _why(source.lateness, summary.clocks)
+            yield f"  {name}: {source.too_old} came later than filter.horizon_s allows{why}"
     if summary.rerun:
         yield f"  late events were fused at their own time: {summary.rerun} events were run again after them"
     for name, clock in summary.clocks.items():
@@ -281,6 +297,18 @@ def _remarks(summary: Summary) -> Iterator[str]:
             yield f"  clock {name}: {clock.method.replace('_', ' ')}, because {clock.note}"
         if clock.resets or clock.strays:
             yield f"  clock {name}: {clock.resets} re-alignments after jumps, {clock.strays} stray stamps"
+
+
+def _why(lateness: TooOld | None, clocks: Mapping[str, ClockReport]) -> str:
+    """Why events were too old, as far as it can be told, and what helps."""
+    if lateness is None:
+        return ""
+    by = f", by up to {lateness.beyond_s:.2f} s"
+    if lateness.late_s * SECOND > PLAUSIBLE_LATENCY and lateness.clock in clocks and clocks[lateness.clock].resets:
+        return f"{by}: clock {lateness.clock} had jumped, and was not re-aligned yet; no horizon helps"
+    if lateness.beyond_s > LONG_S:
+        return f"{by}: look for a link that stalls, or a delay that is configured wrongly"
+    return f"{by}; a horizon longer by that would use them"
 
 
 def _state(summary: Summary) -> Iterator[str]:
