@@ -1,4 +1,4 @@
-"""Replays of logs whose receipt stamps step back: two drives in one file, and a host's clock that was set back."""
+"""One `fusiond replay` of logs whose receipt stamps step back: two drives in one file, a host whose clock was set back."""
 
 from __future__ import annotations
 
