@@ -3,6 +3,10 @@
 The caller gives the engine events in order of receipt; live, it also calls `elapse` while no event comes. All messages to
 publish are handed to one sink, in order.
 
+Where receipts step back (`fusiond.sessions`), the clock of the host was set back, or another drive follows in the log. The
+ticks of the old session are finished, and the fusion begins anew on the new time line. Time since the first event goes on.
+Any other receipt that is earlier than the latest counts as simultaneous with it.
+
 Tick k is k periods after the receipt of the first event. It is made after all events received up to it and before any
 received later, so its messages depend only on the events and their receive stamps. With `publish.on_imu` a tick waits for
 the next inertial sample, for half a period at most, and is made at its receipt: its state is as new as that sample. A tick
@@ -15,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from fractions import Fraction
+from typing import NamedTuple
 
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion, Receipt
@@ -29,6 +34,13 @@ from fusiond.units import SECOND
 MAX_SILENCE_NS = 60 * SECOND  # ticks continue for this long after an event; in a longer gap they are skipped
 
 Sink = Callable[[Message], None]
+
+
+class StepBack(NamedTuple):
+    """The begin of a new session: how long after the first event, and how far the receipts stepped back."""
+
+    since_ns: int
+    by_ns: int
 
 
 class Engine:
@@ -54,7 +66,9 @@ class Engine:
         self.fusion = Fusion(config, stored=stored_state)
         self.publication = None if sink is None or only_states else Publication(config, self.fusion, io_health)
         self.first_ns: int | None = None  # receipt of the first event
-        self.now_ns = 0  # latest receipt so far
+        self.origin_ns = 0  # the first event's instant on the time line of the present session
+        self.now_ns = 0  # latest receipt of the session so far
+        self.steps_back: list[StepBack] = []
         self.ticks = self.skipped = 0  # made, and skipped in long gaps
         self._vehicle = config.vehicle.name
         self._sink, self._pace = sink, pace
@@ -68,12 +82,12 @@ class Engine:
     @property
     def elapsed_ns(self) -> int:
         """Time from the first receipt to the latest."""
-        return 0 if self.first_ns is None else self.now_ns - self.first_ns
+        return self.now_ns - self.origin_ns
 
     @property
     def next_tick_ns(self) -> int | None:
         """When the next tick is made, unless an inertial sample triggers it sooner; None before the first event."""
-        return None if self.first_ns is None else self.first_ns + self._since(self._tick) + self._wait_ns
+        return None if self.first_ns is None else self.origin_ns + self._since(self._tick) + self._wait_ns
 
     @property
     def unfinished(self) -> bool:
@@ -84,6 +98,8 @@ class Engine:
 
     def feed(self, event: Received) -> Receipt | None:
         """Advance to an event's receipt, fuse it, and publish what is due. None if the event was for the clock only."""
+        if event.t_receive_ns < self.now_ns and self.fusion.clock.steps_back(event):
+            self._begin_session(event.t_receive_ns)
         self.advance(event.t_receive_ns)
         receipt = self.fusion.feed(event)
         if receipt is not None:
@@ -96,7 +112,7 @@ class Engine:
     def advance(self, t_receive_ns: int) -> None:
         """Make the ticks before a receipt. A receipt earlier than the latest counts as simultaneous with it."""
         if self.first_ns is None:
-            self.first_ns = self.now_ns = t_receive_ns
+            self.first_ns = self.origin_ns = self.now_ns = t_receive_ns
         if t_receive_ns > self.now_ns:
             self._make_ticks_before(t_receive_ns)
             self.now_ns = t_receive_ns
@@ -104,6 +120,16 @@ class Engine:
         self.flush()
         if self._pace:
             self._pace(self.elapsed_ns)
+
+    def _begin_session(self, t_receive_ns: int) -> None:
+        self.finish()
+        by_ns = self.now_ns - t_receive_ns
+        self.steps_back.append(StepBack(self.elapsed_ns, by_ns))
+        self.origin_ns -= by_ns
+        self.now_ns = t_receive_ns
+        self.fusion.begin_session()
+        if self.publication:
+            self.publication.begin_session(t_receive_ns)
 
     def elapse(self, t_ns: int) -> None:
         """Make the ticks up to an instant, when no earlier event can come any more."""
@@ -140,14 +166,13 @@ class Engine:
         return number * self._period.numerator // self._period.denominator
 
     def _make_ticks_before(self, t_ns: int) -> None:
-        assert self.first_ns is not None
         if self._sink is None:
             return
-        until = min(t_ns, self.now_ns + MAX_SILENCE_NS) - self.first_ns
+        until = min(t_ns, self.now_ns + MAX_SILENCE_NS) - self.origin_ns
         while (since := self._since(self._tick) + self._wait_ns) < until:
             self._make_tick(since)
-        if self._since(self._tick) + self._wait_ns < t_ns - self.first_ns:
-            before = self.first_ns + self._wait_ns - t_ns
+        if self._since(self._tick) + self._wait_ns < t_ns - self.origin_ns:
+            before = self.origin_ns + self._wait_ns - t_ns
             following = -(before * self._period.denominator // self._period.numerator)
             self.skipped += following - self._tick
             self._tick, self._prepared = following, None
@@ -159,11 +184,11 @@ class Engine:
 
     def _make_tick(self, since_ns: int) -> None:
         """Publish the state of the next tick, at an instant [ns from the first event]."""
-        assert self.first_ns is not None and self._sink is not None
+        assert self._sink is not None
         self.flush()
         if self._pace:
             self._pace(since_ns)
-        state, self._prepared = self._prepared or self.message(self.first_ns + since_ns), None
+        state, self._prepared = self._prepared or self.message(self.origin_ns + since_ns), None
         self._last = since_ns, state
         self.ticks += 1
         self._tick += 1

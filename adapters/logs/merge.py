@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import chain, islice
-from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
+from msgspec.structs import replace
+
 from fusiond.config.schema import Config
 from fusiond.events import Received
+from fusiond.sessions import Receipts
 from fusiond.units import SECOND
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
+REACH_NS = 60 * SECOND  # the logs of one host step back within this of each other, but for longer holes in them
 
 Item = TypeVar("Item")
+_Frame = tuple[int, bool, list[Received]]  # latest stamp so far; whether it begins a session; the events
+_Head = tuple[int, int, list[Received]]  # stamp and number of the log that the events are next in
 
 
 def open_logs(paths: Sequence[str | Path], config: Config) -> LogSet:
@@ -40,6 +46,9 @@ class LogSet:
 
     Each log keeps its own order. If its stamps run back, an event counts as received with the latest one before it: nothing
     is lost, and no other log is delayed. Equal stamps are in the order in which the logs were given.
+    Where those of one source step back (`fusiond.sessions`), a new session begins. All logs enter it together, after all of
+    the old one: each at its own step if that is near, else where it is, for then another host's clock has stamped it. A lone
+    stamp behind counts as the latest before it.
     Iterating raises LogError if a file is not a log.
     """
 
@@ -51,9 +60,37 @@ class LogSet:
         if self._begun:
             raise RuntimeError("a LogSet is read once")
         self._begun = True
-        placed = (log.placed() for log in self._logs)
-        frames = map(itemgetter(1), heapq.merge(*placed, key=itemgetter(0)))
-        return _ahead(chain.from_iterable(frames))
+        return _ahead(chain.from_iterable(self._merged()))
+
+    def _merged(self) -> Iterator[list[Received]]:
+        """The events of each frame, session by session."""
+        logs = self._logs
+        heads = [(frame[0], number, frame[2]) for number, log in enumerate(logs) if (frame := log.next_frame())]
+        while heads:
+            heapq.heapify(heads)
+            following: list[_Head] = []  # those of the next session
+            while heads:
+                t_ns, number, events = heads[0]
+                yield events
+                frame = logs[number].next_frame()
+                if frame is None:
+                    heapq.heappop(heads)
+                elif not frame[1]:
+                    heapq.heapreplace(heads, (frame[0], number, frame[2]))
+                else:
+                    heapq.heappop(heads)
+                    if not following:
+                        heads, following = self._divided(heads, t_ns)
+                    following.append((frame[0], number, frame[2]))
+            heads = following
+
+    def _divided(self, heads: list[_Head], t_ns: int) -> tuple[list[_Head], list[_Head]]:
+        """When a log has stepped back after a stamp: as a heap the heads of the logs that still belong to the session, as
+        they end or step back soon; and the other heads, which enter the next session."""
+        own = [head for head in heads if self._logs[head[1]].ends_session_before(t_ns + REACH_NS)]
+        others = [head for head in heads if head not in own]
+        heapq.heapify(own)
+        return own, others
 
     @property
     def bytes_total(self) -> int:
@@ -101,23 +138,58 @@ class _Log:
         self.last_ns = 0
         self.is_empty = False  # read to its end without an event
         self._reading = reading
+        self._placed = self._place()
+        self._ahead: deque[_Frame] = deque()  # read, but not taken
 
-    def placed(self) -> Iterator[tuple[int, list[Received]]]:
-        """The events of each frame, with the latest receive stamp so far."""
-        latest_ns: int | None = None
-        for events in self._reading.frames:
-            if not events:
-                continue
-            t_ns = events[0].t_receive_ns
-            if latest_ns is None or self.first_ns is None:
-                latest_ns = self.first_ns = self.last_ns = t_ns
-            elif t_ns >= latest_ns:
-                latest_ns = self.last_ns = t_ns
-            else:
+    def next_frame(self) -> _Frame | None:
+        """The next frame; None at the end."""
+        return self._ahead.popleft() if self._ahead else next(self._placed, None)
+
+    def ends_session_before(self, until_ns: int) -> bool:
+        """Whether the log ends or steps back before a stamp. It is read up to there."""
+        for frame in chain(tuple(self._ahead), self._read_ahead()):
+            if frame[1]:
+                return True
+            if frame[0] > until_ns:
+                return False
+        return True
+
+    def _read_ahead(self) -> Iterator[_Frame]:
+        for frame in self._placed:
+            self._ahead.append(frame)
+            yield frame
+
+    def _place(self) -> Iterator[_Frame]:
+        """Every frame with events. One that alone steps back counts as received with the latest one before it."""
+        frames = filter(None, self._reading.frames)
+        events = next(frames, None)
+        self.is_empty = events is None
+        if events is None:
+            self.file.bytes_read = self.file.bytes_total
+            return
+        latest_ns = self.first_ns = self.last_ns = events[0].t_receive_ns
+        receipts = Receipts()
+        while events is not None:
+            t_ns, following, steps_back = events[0].t_receive_ns, next(frames, None), False
+            if t_ns >= latest_ns:
+                latest_ns = t_ns
+            elif not receipts.steps_back(events[0].source, t_ns):
                 self.first_ns = min(self.first_ns, t_ns)
                 self.file.counts["stamps run back"] += len(events)
-            yield latest_ns, events
-        self.is_empty = latest_ns is None
+            elif following is None or _is_nearer(following[0].t_receive_ns, latest_ns, t_ns):
+                self.file.counts["stamps run back"] += len(events)
+                events = [replace(event, t_receive_ns=latest_ns) for event in events]
+            else:
+                steps_back = True
+                self.file.counts["steps back"] += 1
+                receipts.clear()
+                self.first_ns, self.last_ns = min(self.first_ns, t_ns), max(self.last_ns, latest_ns)
+                latest_ns = t_ns
+            for event in events:
+                receipts.add(event.source, event.t_receive_ns)
+            yield latest_ns, steps_back, events
+            events = following
+        self.last_ns = max(self.last_ns, latest_ns)
         self.file.bytes_read = self.file.bytes_total
 
     def counts(self) -> dict[str, int]:
@@ -134,6 +206,10 @@ class _Log:
     def span(self) -> str:
         first, last = (_readable(t_ns) for t_ns in (self.first_ns or 0, self.last_ns))
         return f"{self.file.path} from {first} to {last}"
+
+
+def _is_nearer(t_ns: int, this_ns: int, that_ns: int) -> bool:
+    return abs(t_ns - this_ns) < abs(t_ns - that_ns)
 
 
 def _readable(t_ns: int) -> str:

@@ -86,10 +86,13 @@ class Fusion:
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.params.sources}
 
     def feed(self, received: Received) -> Receipt | None:
-        """Align an event and fuse it. None for an event that only informs the clock.
+        """Align an event and fuse it; begin a new session if its receipt steps back. None for an event that only informs the
+        clock.
 
         The source must be one of the configuration's; ValueError otherwise.
         """
+        if self.clock.steps_back(received):
+            self.begin_session()
         measurement = self.clock.align(received)
         return None if measurement is None else self.fuse(measurement)
 
@@ -105,6 +108,12 @@ class Fusion:
             self.invalid[measurement.source][reason] += 1
             return Receipt(measurement, history, history.count(source, Outcome.INVALID), reason)
         return Receipt(measurement, history, history.offer(source, measurement, values))
+
+    def begin_session(self) -> None:
+        """Begin anew on a time line that has stepped back: clocks and state align again; biases, calibrations and counts
+        are kept."""
+        self.clock.forget()
+        self.history = self.history.next_session()
 
     def solution_at(self, t_ns: int) -> Solution:
         """The solution at an instant, from everything received so far: the head, predicted to the instant with the newest

@@ -25,7 +25,7 @@ from fusiond.filter.observations import IMU
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import ROW, Outcome, Rows
 from fusiond.filter.state import NEVER, FilterState
-from fusiond.filter.step import run_one
+from fusiond.filter.step import begin_session, run_one
 
 FIRST_ROWS = 4096
 FIRST_SNAPSHOTS = 64
@@ -37,6 +37,7 @@ class History:
 
     def __init__(self, params: Parameters, compiled: bool | None = None) -> None:
         self.params = params
+        self._compiled = compiled
         self.kernel = make_kernel(params, compiled)
         self.index = {source: i for i, source in enumerate(params.sources)}
         self.rerun = 0  # rows run again because of a late event
@@ -53,6 +54,18 @@ class History:
         self._snapshots = Snapshots(self._head)
         self._attach()
         self._until_forgetting = FORGET_EVERY
+
+    def next_session(self) -> History:
+        """The history of a new session, on a time line that has stepped back: empty but for what the state keeps through an
+        alignment, and the counts. This one stays as it is, for the receipts of its events."""
+        following = History(self.params, self._compiled)
+        following._head.copy_from(self.head)
+        begin_session(following._head)
+        following._snapshots = Snapshots(following._head)
+        following._counts[:] = self.counts
+        following.rerun = self.rerun
+        following._attach()
+        return following
 
     def _attach(self) -> None:
         kept = self._snapshots

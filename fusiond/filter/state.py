@@ -164,6 +164,7 @@ class ResetReason(IntEnum):
     SOURCE_RETURNED = 4  # a receiver contradicted the state, and the state was likelier to be wrong
     HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored one
     INERTIAL_LIED = 6  # the inertial sensor lied for a while, by all other sources: its part was taken back
+    TIME_STEPPED_BACK = 7  # receipt stamps stepped back, a new session: it aligns again
 
 
 class Verdict(IntEnum):

@@ -133,6 +133,14 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
     state.source_stamps[source, T_LAST] = t_ns
 
 
+def begin_session(state: FilterState) -> None:
+    """Begin anew on a time line that has stepped back: keep biases, calibrations and counts, and align."""
+    if state.stamps[PHASE] == RUNNING:
+        count_reset(state, ResetReason.TIME_STEPPED_BACK)
+    initial_alignment.begin(state)
+    state.bank[:] = 0.0
+
+
 def _heard_gnss(state: FilterState, params: Parameters) -> bool:
     """Whether GNSS velocities came until the IMU fell silent, and so will again: without them an alignment would not end."""
     return any(state.stamps[T_IMU] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS for i in params.velocities)

@@ -37,11 +37,12 @@ class Innovations:
 
     def __init__(self, vehicle: str, fusion: Fusion) -> None:
         params = fusion.params
-        self._vehicle, self._history = vehicle, fusion.history
+        self._vehicle, self._fusion, self._history = vehicle, fusion, fusion.history
         self._imu = params.sources[params.imu_source]
         self._margin_ns, self._ahead_ns = int(MARGIN * params.horizon_ns), int(AHEAD * params.horizon_ns)
         self._pending: list[Receipt] = []
         self._read: dict[Key, _Row] = {}  # rows of pending measurements that had to be read early
+        self._over: list[InnovationMessage] = []  # of a session that is over, not published yet
         self._unread_ns = NEVER_NS  # stamp of the oldest pending measurement whose row has not been read yet
 
     def add(self, receipt: Receipt) -> None:
@@ -53,14 +54,21 @@ class Innovations:
         if self._unread_ns < self._history.settled_ns + self._margin_ns:
             self._read_in_time()
 
+    def begin_session(self) -> None:
+        """Go on with the history of a new session. What still waits for the IMU waits for ever, and is published so."""
+        rows = self._read | self._rows(self._pending)
+        self._over += [self._message(one, self._row(one, rows)) for one in self._pending]
+        self._pending, self._read, self._unread_ns = [], {}, NEVER_NS
+        self._history = self._fusion.history
+
     def published(self) -> list[InnovationMessage]:
         """The messages whose outcome has become known since the last call, in order of receipt."""
         receipts, self._pending = self._pending, []
         rows = self._read | self._rows(receipts)
         self._read = {}
-        found = []
+        found, self._over = self._over, []
         for left, receipt in zip(range(len(receipts), 0, -1), receipts, strict=True):
-            row = rows.get(self._key(receipt.measurement)) if receipt.refusal is None else None
+            row = self._row(receipt, rows)
             if row is not None and row.outcome is Outcome.WAITING and left <= MAX_PENDING:
                 self._pending.append(receipt)
             elif receipt.measurement.source != self._imu or (row is not None and row.outcome is Outcome.REJECTED):
@@ -86,6 +94,10 @@ class Innovations:
         columns = (rows[name].tolist() for name in ("outcome", "ratio", "innovation", "variance"))
         found = zip(keys, *columns, strict=True)
         return {key: _Row(Outcome(outcome), *values) for key, outcome, *values in found if key in wanted}
+
+    def _row(self, receipt: Receipt, rows: dict[Key, _Row]) -> _Row | None:
+        """The row of a receipt, if it has one."""
+        return rows.get(self._key(receipt.measurement)) if receipt.refusal is None else None
 
     def _key(self, measurement: Measurement) -> Key:
         return measurement.t_ns, self._history.index[measurement.source], measurement.sequence

@@ -96,6 +96,14 @@ class Publication:
                 self._sources.measure_rates(state.t_ns)
             yield self.health(since_start_ns, state)
 
+    def begin_session(self, t_receive_ns: int) -> None:
+        """Go on with a time line that has stepped back, to a receipt."""
+        self._last_settled_ns = NEVER
+        if self._innovations:
+            self._innovations.begin_session()
+        self._sources.begin_session(t_receive_ns)
+        self._changes.begin_session()
+
     def _settled(self) -> Iterator[Message]:
         estimate = self._fusion.settled()
         if estimate.t_ns > self._last_settled_ns:  # each only once
@@ -138,6 +146,11 @@ class Sources:
     def add(self, event: Received) -> None:
         self._received[event.source] = event.t_receive_ns
         self._clocks[event.source] = event.clock
+
+    def begin_session(self, t_receive_ns: int) -> None:
+        """Count every source as heard just now: one that falls silent is lost as always."""
+        self._received = dict.fromkeys(self._received, t_receive_ns)
+        self._counted_ns = 0
 
     def present(self, t_ns: int) -> frozenset[str]:
         """The sources from which something was received recently."""
@@ -185,6 +198,10 @@ class Changes:
         self._statuses = dict.fromkeys(fusion.params.sources, "nominal")
         self._next_status_ns: int = NEVER
 
+    def begin_session(self) -> None:
+        """Go on with a time line that has stepped back."""
+        self._next_status_ns = NEVER
+
     def since(self, state: StateMessage, present: frozenset[str]) -> Iterator[EventMessage]:
         """The events since the previous tick."""
 
@@ -224,8 +241,9 @@ class Changes:
             ResetReason.DATA_GAP: f"no data for more than {self._config.filter.restart_gap_s:g} s; aligning again",
             ResetReason.HEADING_LOST: "the heading was lost without the IMU; aligning again",
             ResetReason.NOT_FINITE: "the state was not finite; aligning again",
-            ResetReason.SOURCE_RETURNED: f"{source}: it contradicted the state, which was likelier to be wrong and was set to it",
+            ResetReason.SOURCE_RETURNED: f"{source}: it contradicted the state, which was likelier to be wrong; now set to it",
             ResetReason.INERTIAL_LIED: "the inertial sensor contradicted all others; its part was taken back",
+            ResetReason.TIME_STEPPED_BACK: "receipt stamps stepped back, a new session; aligning again",
             ResetReason.HEADING_DECIDED: "the drive contradicted or confirmed the stored heading; the heading is decided",
         }[ResetReason(int(stamps[RESET_REASON]))]
 

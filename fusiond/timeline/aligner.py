@@ -24,7 +24,8 @@ fallen         late by over PLAUSIBLE_LATENCY and FALL behind the newest stamp: 
 late           by as much, without a fall: a stalled link, or the host was set forward. Keeps its alignment; if it stays
                equally late for 2 s of both clocks (10 s where it is only SLOW), the clock has moved.
 Consecutive stamps of one source that agree re-align the clock at once: a new epoch, counted, which may step either way. A
-stamp of any source that fits ends every streak; a repeated one adds nothing.
+stamp of any source that fits ends every streak; but with a least offset not that of another source a little in the
+future, which may just be the quicker one. A repeated stamp adds nothing.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ FUTURE_TOLERANCE = 50 * MILLISECOND  # an aligned stamp may lie this far after i
 PLAUSIBLE_LATENCY = 2 * SECOND  # a stamp later than this (boot clock: beyond what is usual for its source) does not fit
 FALL = SECOND  # a stamp this far behind the newest one is more than out of order
 SLOW = 100 * MILLISECOND  # beyond the source's usual lateness: a congested link; if it lasts, the clock has moved
+QUICKER = 500 * MILLISECOND  # one source may come this much sooner than another
 CONSISTENT = 250 * MILLISECOND  # consecutive stamps agree on a new offset within this
 PAIR_TOLERANCE = 20 * MILLISECOND  # a clock pair off by more is odd; two odd pairs that agree replace the estimate
 TRUST_LOST_AFTER = 1_500 * MILLISECOND  # this span of stamps that do not fit, without one that does
@@ -125,6 +127,11 @@ class Aligner:
         self.complaint = ""  # why a better method is not in use
         self._unix = unix
         self._pieces: deque[_Piece] = deque(maxlen=PIECES)
+
+    def forget(self) -> None:
+        """Forget all but the counts; the next stamp is like the first."""
+        self.complaint = ""
+        self._pieces.clear()
 
     def _begin(self, stamp: int, receive: int, offset: int) -> None:
         """Forget everything; from here on, receipt less stamp is `offset` or more."""
@@ -244,7 +251,10 @@ class Aligner:
         """The clock has not moved: sources that were slow are usually slow."""
         if self._streaks:
             self._usual |= {name: streak.late for name, streak in self._streaks.items() if streak.verdict is _Verdict.SLOW}
-            self._streaks.clear()
+            quicker = {n: s for n, s in self._streaks.items() if n != source and s.verdict is _Verdict.FUTURE}
+            if self.anchored:
+                quicker.clear()
+            self._streaks = {n: s for n, s in quicker.items() if s.late >= -QUICKER}
         if late < self._usual.get(source, 0):
             self._usual[source] = max(0, late)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from fusiond.config.schema import Config
 from fusiond.events import HOST_CLOCK, UNIX_CLOCK, ClockPair, Invalid, Measurement, Received
+from fusiond.sessions import Receipts
 from fusiond.timeline.aligner import Aligner, ClockReport
 
 ABSURD = "sensor stamp is not positive"
@@ -21,10 +22,22 @@ class Clock:
         self._delays = {name: source.delay_ns for name, source in config.streams().items()}
         self._aligners = {UNIX_CLOCK: Aligner(None)}
         self._arrivals = 0
+        self._receipts = Receipts()
+
+    def steps_back(self, received: Received) -> bool:
+        """Whether the receipts have stepped back with this event, so that nothing learnt so far is of use: see `forget`."""
+        return self._receipts.steps_back(received.source, received.t_receive_ns)
+
+    def forget(self) -> None:
+        """Begin a new session: forget every alignment, but not the counts."""
+        self._receipts.clear()
+        for aligner in self._aligners.values():
+            aligner.forget()
 
     def align(self, received: Received) -> Measurement | None:
         """The measurement; its payload is Invalid if the stamp is unusable. None for a ClockPair."""
         payload = received.payload
+        self._receipts.add(received.source, received.t_receive_ns)
         if isinstance(payload, ClockPair):
             self._learn(received, payload)
             return None

@@ -33,6 +33,9 @@ def run(arguments: argparse.Namespace) -> None:
     logs, clock, gathering = open_logs(arguments.logs, loaded), Clock(loaded), Gathering(loaded)
     progress = shown(logs, lambda: logs.bytes_read / logs.bytes_total, lambda: gathering.elapsed_ns, sys.stderr)
     for received in progress:
+        if clock.steps_back(received):
+            clock.forget()
+            gathering.begin_session(received.t_receive_ns)
         measurement = clock.align(received)
         if measurement is not None:
             gathering.add(measurement)

@@ -12,13 +12,14 @@ from fusiond.config.schema import Config
 from fusiond.errors import UnusableError
 from fusiond.events import GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.maths.typed import Array
-from fusiond.units import MILLISECOND
+from fusiond.units import MILLISECOND, SECOND
 
 BIN_NS = 100 * MILLISECOND  # readings are averaged over this time
 BIN = BIN_NS * 1e-9  # s
 WINDOW_BINS = 10  # of a window: its change of speed is that between its ends
 WINDOW = WINDOW_BINS * BIN  # s
 MIN_WINDOWS = 10
+APART_NS = 10 * SECOND  # between two sessions: more than any latency
 MAX_GAP = 1.5  # s: between two speeds further apart none is known
 MIN_COURSE_SPEED = 3.0  # m/s: at a lower speed the course is not used
 
@@ -54,20 +55,26 @@ class Gathering:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._span_ns: tuple[int, int] | None = None
+        self._moved_ns = 0  # added to the stamps of the present session
         self._imu: Bins = {}
         self._course: Bins = {}
         self._wheels: dict[str, Bins] = {name: {} for name in config.wheel}
 
+    def begin_session(self, t_receive_ns: int) -> None:
+        """Receipts have stepped back, to this one: what follows is placed after all the rest."""
+        if self._span_ns:
+            self._moved_ns = self._span_ns[1] + APART_NS - t_receive_ns
+
     def add(self, measurement: Measurement) -> None:
         """Add one event; other kinds are ignored."""
-        payload = measurement.payload
+        payload, t_ns = measurement.payload, measurement.t_ns + self._moved_ns
         if isinstance(payload, ImuSample):
-            self._span_ns = (self._span_ns or (measurement.t_ns, 0))[0], measurement.t_ns
-            _put(self._imu, measurement.t_ns, (*payload.specific_force_b, *payload.angular_rate_b))
+            self._span_ns = (self._span_ns or (t_ns, 0))[0], t_ns
+            _put(self._imu, t_ns, (*payload.specific_force_b, *payload.angular_rate_b))
         elif isinstance(payload, GnssVelocity):
-            _put(self._course, measurement.t_ns, (payload.north, payload.east))
+            _put(self._course, t_ns, (payload.north, payload.east))
         elif isinstance(payload, WheelSpeed):
-            _put(self._wheels[measurement.source], measurement.t_ns, (payload.speed,))
+            _put(self._wheels[measurement.source], t_ns, (payload.speed,))
 
     @property
     def elapsed_ns(self) -> int:

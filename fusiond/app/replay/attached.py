@@ -48,7 +48,7 @@ class Attached:
         self.warnings: list[str] = []
         self._config, self._paced = config, pacer is not None
         self._engine: Engine | None = None
-        clock = ReplayClock(lambda: self._running.first_ns or 0, lambda: self._running.now_ns, pacer)
+        clock = ReplayClock(lambda: self._running.origin_ns, lambda: self._running.now_ns, pacer)
         made: list[LiveOutput]
         if everything:
             config, self.warnings = attachable(config)

@@ -35,9 +35,20 @@ def stored_state(path: Path, config: Config) -> StoredState:
 
 def truth_of(path: Path) -> Truth:
     """A reference track; a first pass detects any error in the file. Raises TruthError."""
-    for _ in _read_truth(path):
+    samples = _TruthFile(path)
+    for _ in samples:
         pass
-    return Truth(_read_truth(path))
+    return Truth(samples)
+
+
+class _TruthFile:
+    """The samples of a file, read anew each time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __iter__(self) -> Iterator[TruthSample]:
+        return _read_truth(self._path)
 
 
 def _read_truth(path: Path) -> Iterator[TruthSample]:

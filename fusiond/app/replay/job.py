@@ -66,7 +66,7 @@ def replay(options: Options) -> Summary:
     task = ReplayTask(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)
     task.stored_state = stored_state(options.stored, config) if options.stored else None
     task.truth = truth_of(options.truth) if options.truth else None
-    trace = Trace() if options.plot else None
+    trace = Trace(lambda: run.engine.origin_ns) if options.plot else None
     if trace:
         task.on_tick.append(trace.add_tick)
         task.on_receipt.append(trace.add_receipt)

@@ -35,16 +35,17 @@ class Pacer:
 class ReplayClock(HostClock):
     """The time of a replayed drive: the time that is due by its pacer, or without one the time reached.
 
-    `first_ns` and `now_ns` return the receipts of the first and of the latest event.
+    `origin_ns` returns the instant of the first event on the time line of the present session, `now_ns` the receipt of the
+    latest event.
     """
 
-    def __init__(self, first_ns: Callable[[], int], now_ns: Callable[[], int], pacer: Pacer | None) -> None:
+    def __init__(self, origin_ns: Callable[[], int], now_ns: Callable[[], int], pacer: Pacer | None) -> None:
         super().__init__()
-        self._first_ns, self._reached_ns, self._pacer = first_ns, now_ns, pacer
+        self._origin_ns, self._reached_ns, self._pacer = origin_ns, now_ns, pacer
 
     def now_ns(self) -> int:
         """The present instant of the drive."""
-        return self._reached_ns() if self._pacer is None else self._first_ns() + self._pacer.elapsed_ns
+        return self._reached_ns() if self._pacer is None else self._origin_ns() + self._pacer.elapsed_ns
 
     def from_wall_ns(self, wall_ns: int) -> int:
         """The present instant: stamps of the wall clock have no meaning here."""

@@ -89,8 +89,8 @@ def _close_up(axes: Axes, ticks: Sequence[TickSample], summary: Summary) -> None
     axes.set(title="Close-up: the end of the longest dead reckoning" if longest else "Close-up: the end", aspect="equal")
     if not ticks:
         return
-    stop_ns = summary.span.first_ns + nanoseconds(longest.stop_s) if longest else ticks[-1].t_ns
-    centre = min(ticks, key=lambda tick: abs(tick.t_ns - stop_ns))
+    stop_ns = nanoseconds(longest.stop_s) if longest else ticks[-1].since_ns
+    centre = min(ticks, key=lambda tick: abs(tick.since_ns - stop_ns))
     axes.set_box_aspect(0.5)
     axes.set_xlim(centre.east_m - CLOSE_UP_M, centre.east_m + CLOSE_UP_M)
     axes.set_ylim(centre.north_m - CLOSE_UP_M / 2, centre.north_m + CLOSE_UP_M / 2)
@@ -102,8 +102,7 @@ def _places(fixes: Sequence[FixSample]) -> tuple[list[float], list[float]]:
 
 def _errors(axes: Sequence[Axes], ticks: Sequence[TickSample], rejected: Sequence[FixSample], summary: Summary) -> None:
     """Errors and their band of two sigma; without a truth only the band."""
-    first_ns = summary.span.first_ns
-    second = np.array([(tick.t_ns - first_ns) / SECOND for tick in ticks])
+    second = np.array([tick.since_ns / SECOND for tick in ticks])
     offset = summary.truth.heading.offset_deg if summary.truth else 0.0
     errors = [tick.errors for tick in ticks]
     none = float("nan")
@@ -122,7 +121,7 @@ def _errors(axes: Sequence[Axes], ticks: Sequence[TickSample], rejected: Sequenc
         for stretch in summary.dead_reckoning.stretches if summary.dead_reckoning else ():
             ax.axvspan(stretch.start_s, stretch.stop_s, color=GREEN, alpha=0.15, linewidth=0)
         for fix in rejected[:MAX_MARKS]:
-            ax.axvline((fix.t_ns - first_ns) / SECOND, color=VERMILION, alpha=0.25, linewidth=1.0)
+            ax.axvline(fix.since_ns / SECOND, color=VERMILION, alpha=0.25, linewidth=1.0)
     for ax in axes[:-1]:
         ax.tick_params(labelbottom=False)
     axes[-1].set_xlabel("time from the first event [s]")

@@ -18,7 +18,9 @@ from fusiond.app.replay.summary import (
     Publications,
     SourceReport,
     Span,
+    StepBack,
     Summary,
+    TooOld,
     source_report,
 )
 from fusiond.app.replay.truth import Truth
@@ -78,6 +80,7 @@ class Replay:
         self._withheld: Counter[str] = Counter()
         self._modes: Counter[str] = Counter()
         self._latencies = {source: Latencies() for source in config.sources()}
+        self._lateness: dict[str, TooOld] = {}  # by source
         self._comparison = Comparison(task.window)
         self._reckoning = DeadReckoningLog(config.filter.position_timeout_s)
 
@@ -103,8 +106,8 @@ class Replay:
         return self.engine.elapsed_ns
 
     def _is_withheld(self, event: Received) -> bool:
-        first_ns = event.t_receive_ns if self.first_ns is None else self.first_ns
-        since_ns = max(event.t_receive_ns, self.engine.now_ns) - first_ns
+        engine = self.engine
+        since_ns = max(event.t_receive_ns, engine.now_ns) - engine.origin_ns if engine.first_ns is not None else 0
         return any(
             event.source in held.sources and held.start_ns <= since_ns < held.stop_ns for held in self._task.withheld
         )
@@ -113,11 +116,18 @@ class Replay:
         if receipt is None:
             self.clock_pairs += isinstance(event.payload, ClockPair)
             return
+        if receipt.refusal is Outcome.TOO_OLD:
+            self._note_lateness(event, receipt)
         if receipt.refusal is not Outcome.INVALID:
             measurement = receipt.measurement
             self._latencies[measurement.source].add(measurement.t_receive_ns - measurement.t_ns)
         for sink in self._task.on_receipt:
             sink(receipt)
+
+    def _note_lateness(self, event: Received, receipt: Receipt) -> None:
+        found, measurement = self._lateness.setdefault(event.source, TooOld(clock=event.clock)), receipt.measurement
+        found.late_s = max(found.late_s, (measurement.t_receive_ns - measurement.t_ns) / SECOND)
+        found.beyond_s = max(found.beyond_s, (receipt.history.settled_ns - measurement.t_ns) / SECOND)
 
     def _receive(self, message: Message) -> None:
         if isinstance(message, StateMessage):
@@ -126,8 +136,7 @@ class Replay:
             sink(message)
 
     def _add_state(self, state: StateMessage) -> None:
-        assert self.first_ns is not None
-        since_start_ns = state.t_ns - self.first_ns
+        since_start_ns = state.t_ns - self.engine.origin_ns
         errors = errors_of(state, self._task.truth.at(state.t_ns)) if self._task.truth else None
         self._modes[state.mode.value] += 1
         self._reckoning.add(since_start_ns, state, errors)
@@ -150,6 +159,7 @@ class Replay:
             vehicle=self.config.vehicle.name,
             logs=logs,
             warnings=warnings,
+            steps_back=[StepBack(at_s=one.since_ns / SECOND, by_s=one.by_ns / SECOND) for one in engine.steps_back],
             span=Span(first_ns=engine.first_ns, last_ns=engine.now_ns, seconds=self.elapsed_ns / SECOND),
             events=self.events,
             clock_pairs=self.clock_pairs,
@@ -170,6 +180,7 @@ class Replay:
                 outcomes[name],
                 fusion.invalid[name],
                 self._latencies[name].report(),
+                self._lateness.get(name),
                 self._remark(name, outcomes[name]),
             )
             for name in self.config.sources()

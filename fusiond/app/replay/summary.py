@@ -14,11 +14,13 @@ from fusiond.app.replay.comparison import Errors, TruthReport
 from fusiond.app.replay.statistics import Histogram
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
-from fusiond.timeline.aligner import ClockReport
+from fusiond.timeline.aligner import PLAUSIBLE_LATENCY, ClockReport
 from fusiond.units import MILLISECOND, SECOND
 
 LATENCY_STEP_MS, LATENCY_LIMIT_MS = 0.1, 10_000.0  # width and limit of the histogram's bins
 BATCH = 1024  # latencies added to the histogram together
+LONG_S = 5.0  # an event later than the horizon by more than this is not a matter of the horizon
+MAX_STEPS = 5  # steps back that the text lists
 MAX_STRETCHES = 50  # stretches of dead reckoning that are listed
 
 
@@ -30,6 +32,14 @@ class Latency(Struct, frozen=True, kw_only=True):
     p90: float
     p99: float
     max: float
+
+
+class TooOld(Struct, kw_only=True):
+    """How late the events of a source were that came after the horizon, at the most."""
+
+    late_s: float = 0.0  # receipt less the instant measured
+    beyond_s: float = 0.0  # by how much the horizon was too short
+    clock: str = ""  # that stamped them; empty if none did
 
 
 class SourceReport(Struct, frozen=True, kw_only=True):
@@ -45,15 +55,23 @@ class SourceReport(Struct, frozen=True, kw_only=True):
     withheld: int
     invalid_reasons: dict[str, int]
     latency_ms: Latency | None  # None if no event was usable
+    lateness: TooOld | None = None  # of those that were too old
     remark: str = ""  # what is wrong with a wheel most of whose readings were rejected
 
 
 class Span(Struct, frozen=True, kw_only=True):
-    """From the receipt of the first event to that of the last."""
+    """From the receipt of the first event to that of the last. `seconds` leaves out what the stamps stepped back."""
 
     first_ns: int
     last_ns: int
     seconds: float
+
+
+class StepBack(Struct, frozen=True, kw_only=True):
+    """Where the receipt stamps step back, and a new session begins."""
+
+    at_s: float  # from the first event
+    by_s: float
 
 
 class Publications(Struct, frozen=True, kw_only=True):
@@ -92,6 +110,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     logs: dict[str, dict[str, int]]  # counts of the readers, by file name
     warnings: list[str]
     span: Span
+    steps_back: list[StepBack] = []
     events: int
     clock_pairs: int  # events that are only for the clock
     rerun: int  # events run again because another was late
@@ -190,7 +209,12 @@ class DeadReckoningLog:
 
 
 def source_report(
-    withheld: int, outcomes: Mapping[str, int], reasons: Mapping[str, int], latency: Latency | None, remark: str = ""
+    withheld: int,
+    outcomes: Mapping[str, int],
+    reasons: Mapping[str, int],
+    latency: Latency | None,
+    lateness: TooOld | None = None,
+    remark: str = "",
 ) -> SourceReport:
     """`outcomes`: counts by Outcome's names."""
     counts = {name.lower(): count for name, count in outcomes.items()}
@@ -199,6 +223,7 @@ def source_report(
         withheld=withheld,
         invalid_reasons=dict(sorted(reasons.items())),
         latency_ms=latency,
+        lateness=lateness,
         remark=remark,
         **counts,
     )
@@ -219,6 +244,13 @@ def _lines(summary: Summary) -> Iterator[str]:
     yield f"{summary.vehicle}: {span.seconds:.1f} s from {first:%Y-%m-%d %H:%M:%S} UTC out of {logs}"
     for warning in summary.warnings:
         yield f"warning: {warning}"
+    for step in summary.steps_back[:MAX_STEPS]:
+        yield (
+            f"warning: at {step.at_s:.1f} s the receipt stamps step back by {step.by_s:.1f} s: a new session begins there,"
+            " with clocks and state aligned again"
+        )
+    if len(summary.steps_back) > MAX_STEPS:
+        yield f"warning: and {len(summary.steps_back) - MAX_STEPS} more times"
     yield ""
     yield from _source_table(summary.sources)
     yield from _remarks(summary)
@@ -261,7 +293,8 @@ def _remarks(summary: Summary) -> Iterator[str]:
         if source.remark:
             yield f"  {name} is of no use: {source.remark}"
         if source.too_old:
-            yield f"  {name}: {source.too_old} came later than filter.horizon_s allows; a longer horizon would use them"
+            why = _why(source.lateness, summary.clocks)
+            yield f"  {name}: {source.too_old} came later than filter.horizon_s allows{why}"
     if summary.rerun:
         yield f"  late events were fused at their own time: {summary.rerun} events were run again after them"
     for name, clock in summary.clocks.items():
@@ -269,6 +302,18 @@ def _remarks(summary: Summary) -> Iterator[str]:
             yield f"  clock {name}: {clock.method.replace('_', ' ')}, because {clock.note}"
         if clock.resets or clock.strays:
             yield f"  clock {name}: {clock.resets} re-alignments after jumps, {clock.strays} stray stamps"
+
+
+def _why(lateness: TooOld | None, clocks: Mapping[str, ClockReport]) -> str:
+    """Why events were too old, as far as it can be told, and what helps."""
+    if lateness is None:
+        return ""
+    by = f", by up to {lateness.beyond_s:.2f} s"
+    if lateness.late_s * SECOND > PLAUSIBLE_LATENCY and lateness.clock in clocks and clocks[lateness.clock].resets:
+        return f"{by}: clock {lateness.clock} had jumped, and was not re-aligned yet; no horizon helps"
+    if lateness.beyond_s > LONG_S:
+        return f"{by}: look for a link that stalls, or a delay that is configured wrongly"
+    return f"{by}; a horizon longer by that would use them"
 
 
 def _state(summary: Summary) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 from fusiond.app.replay.comparison import Errors
@@ -40,7 +41,7 @@ class Thinned(Generic[Item]):
 class TickSample(NamedTuple):
     """One publication; positions are in metres north and east of the trace's origin, the first position of all."""
 
-    t_ns: int
+    since_ns: int  # from the first event
     north_m: float
     east_m: float
     yaw_deg: float
@@ -56,15 +57,16 @@ class TickSample(NamedTuple):
 class FixSample(NamedTuple):
     """One GNSS position as received."""
 
-    t_ns: int  # instant of the measurement, aligned
+    since_ns: int  # from the first event to the instant of the measurement
     north_m: float
     east_m: float
 
 
 class Trace:
-    """Collects the samples of one replay."""
+    """Collects the samples of one replay. `origin_ns` returns the instant of its first event on the present time line."""
 
-    def __init__(self) -> None:
+    def __init__(self, origin_ns: Callable[[], int]) -> None:
+        self._origin_ns = origin_ns
         self.ticks: Thinned[TickSample] = Thinned()
         self.fixes: Thinned[FixSample] = Thinned()
         self.rejected: Thinned[FixSample] = Thinned()  # separate, so that thinning does not lose the few
@@ -83,16 +85,17 @@ class Trace:
         sigma_north, sigma_east, _ = state.sigma_position_ned_m
         reckoned = message.mode is Mode.DEAD_RECKONING
         sigmas = (sigma_north, sigma_east, state.sigma_yaw_deg)
-        self.ticks.add(TickSample(message.t_ns, north, east, state.yaw_deg, *sigmas, reckoned, errors, *true))
+        since_ns = message.t_ns - self._origin_ns()
+        self.ticks.add(TickSample(since_ns, north, east, state.yaw_deg, *sigmas, reckoned, errors, *true))
 
     def add_receipt(self, receipt: Receipt) -> None:
         """The outcome is read later: reading it here would make the history run its rows again for each late fix."""
         measurement, fix = receipt.measurement, receipt.measurement.payload
-        if self._unread and measurement.t_receive_ns - self._unread[0][0].measurement.t_receive_ns > MAX_UNREAD_NS:
+        if self._unread and abs(measurement.t_receive_ns - self._unread[0][0].measurement.t_receive_ns) > MAX_UNREAD_NS:
             self.read_outcomes()
         if isinstance(fix, GnssPosition) and receipt.refusal is not Outcome.INVALID:
             north, east = self._place(math.degrees(fix.latitude), math.degrees(fix.longitude), fix.height)
-            self._unread.append((receipt, FixSample(measurement.t_ns, north, east)))
+            self._unread.append((receipt, FixSample(measurement.t_ns - self._origin_ns(), north, east)))
 
     def read_outcomes(self) -> None:
         """Read the outcomes of the latest fixes; call it at the end, too."""

@@ -75,15 +75,21 @@ def _sample(cells: list[str], where: str) -> TruthSample:
 
 
 class Truth:
-    """A reference track, read as it is needed: the instants asked for must not decrease."""
+    """A reference track, read as it is needed, and again from its begin for an instant before the last one asked for."""
 
     def __init__(self, samples: Iterable[TruthSample]) -> None:
-        self._samples = iter(samples)
+        self._all = samples
+        self._begin()
+
+    def _begin(self) -> None:
+        self._samples = iter(self._all)
         self._before: TruthSample | None = None
         self._after = next(self._samples, None)
 
     def at(self, t_ns: int) -> TruthSample | None:
         """The track at an instant, interpolated linearly (angles the short way round); None outside it and in gaps."""
+        if self._before is not None and t_ns < self._before.t_ns:
+            self._begin()
         while self._after is not None and self._after.t_ns <= t_ns:
             self._before, self._after = self._after, next(self._samples, None)
         before, after = self._before, self._after

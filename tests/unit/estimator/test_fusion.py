@@ -20,8 +20,9 @@ from fusiond.events import (
     boot_clock,
 )
 from fusiond.filter.rows import Outcome
+from fusiond.filter.state import GYRO_BIAS_B, ResetReason
 from fusiond.maths.wgs84 import geodetic
-from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
+from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, reset_by, same_bits, town
 
 SETTINGS = config(filter={"heading_deg": 40.0})
 TRUTH = town(4.0, rate=50.0)
@@ -137,3 +138,31 @@ def test_bad_data_is_counted_with_its_reason(compiled: bool, payload: Payload | 
 def test_an_unknown_source_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"no source 'radar0'.*front_left"):
         Fusion(SETTINGS).fuse(event("radar0", WheelSpeed(1.0)))
+
+
+def test_receipts_that_step_back_begin_a_new_session(compiled: bool) -> None:
+    """Biases, calibrations and counts go on; an earlier receipt still has the history of its own session."""
+
+    def received(events: list[Measurement], by_ns: int) -> list[Received]:
+        return [Received(one.source, one.sequence, "", None, one.t_ns - by_ns, one.payload) for one in events]
+
+    settings = config(filter={"heading_deg": 40.0, "restart_gap_s": 3.0})
+    fusion, own = Fusion(settings, compiled), Fusion(settings, compiled)
+    receipts = [fusion.feed(one) for one in received(EVENTS, 0)]
+    first, before, history = fusion.totals(), fusion.history.head.copy(), fusion.history
+    later = received(EVENTS, 60 * SECOND)
+    fusion.feed(later[0])
+    assert fusion.history is not history
+    assert reset_by(fusion)[:2] == (1, ResetReason.TIME_STEPPED_BACK)
+    aligning = fusion.history.head
+    kept = slice(GYRO_BIAS_B.start, aligning.size + 1)
+    assert aligning.nominal[kept].tobytes() == before.nominal[kept].tobytes()
+    assert fusion.solution_at(END - 60 * SECOND).mode is Mode.ALIGNING
+    for one in later[1:]:
+        fusion.feed(one)
+    for one in later:
+        own.feed(one)
+    assert receipts[-1] is not None and receipts[-1].outcome is not Outcome.TOO_OLD
+    gained = {name: count - first[name] for name, count in fusion.totals().items()}
+    assert gained == own.totals() and gained["TOO_OLD"] == 0
+    assert fusion.solution_at(END - 60 * SECOND).mode is Mode.NOMINAL

@@ -16,6 +16,7 @@ LAYERS = (  # from the bottom; those of one line do not import each other
     ("fusiond.units",),
     ("fusiond.maths",),
     ("fusiond.events",),
+    ("fusiond.sessions",),
     ("fusiond.config",),
     ("fusiond.timeline", "fusiond.filter", "fusiond.simulation"),
     ("fusiond.estimator",),

@@ -337,3 +337,19 @@ def test_captured_drive(name: str, gps_clock: str, least: int, most: int) -> Non
     assert least * MS < min(ages["gps0.position"])
     assert max(ages["gps0.position"]) < most * MS
     assert {report.method for name, report in clock.report().items() if name == BOOT} == {"system_time"}
+
+
+# ---------------------------------------------------------------------------- receipts that step back
+
+
+def test_a_forgotten_clock_aligns_like_a_new_one_and_keeps_its_counts() -> None:
+    """The boot clock goes on over an hour's step back of the host."""
+    clock, new = Clock(Config()), Clock(Config())
+    feed_imu(clock, SECOND, 3 * SECOND)
+    samples = clock.report()[BOOT].samples
+    later = [imu(boot, T0 - HOUR + boot + 3 * MS) for boot in range(3 * SECOND, 5 * SECOND, 10 * MS)]
+    assert clock.steps_back(later[0]) and not new.steps_back(later[0])
+    clock.forget()
+    assert [clock.align(event) for event in later] == [new.align(event) for event in later]
+    report = clock.report()[BOOT]
+    assert (report.samples, report.resets, report.strays) == (samples + len(later), 0, 0)

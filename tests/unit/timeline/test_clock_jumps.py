@@ -192,3 +192,19 @@ def test_a_clock_recovers_from_any_disorder(seed: int) -> None:
     assert (placed.payload, fixed.payload) == (IMU, FIX)
     assert -50 * MS <= placed.t_receive_ns - placed.t_ns <= 100 * MS
     assert -50 * MS <= fixed.t_receive_ns - fixed.t_ns <= 165 * MS
+
+
+@pytest.mark.parametrize(("quicker", "follows"), [(100 * MS, True), (400 * MS, True), (600 * MS, False)])
+def test_a_quicker_source_shows_the_latency_of_another(quicker: int, follows: bool) -> None:
+    """The host is an hour off, so Unix stamps have a least offset: first that of the fixes, then that of SYSTEM_TIME. One
+    that is further ahead has the wrong time."""
+    clock, latency = Clock(Config()), 5 * MS + quicker
+    for second in range(1, 30):
+        now = T0 + second * SECOND
+        for fifth in range(5):
+            stamp = now + fifth * 200 * MS
+            found = valid(clock, fix(stamp + HOUR, stamp + latency))
+            if second > 3:
+                assert found == pytest.approx(stamp + (5 * MS if follows else latency), abs=MS)
+        clock.align(system_time(now + SECOND + HOUR, (second + 1) * SECOND, now + SECOND + 5 * MS))
+    assert (clock.report()["unix"].resets, clock.report()["unix"].method) == (int(follows), "least_offset")

@@ -22,3 +22,6 @@ def test_kernel_stamps_on_the_time_line_through_a_clock_step(monkeypatch: pytest
     assert clock.from_wall_ns(wall - 3 * MS) == before - 3 * MS
     assert clock.from_wall_ns(wall - 3600 * SECOND) == before  # stamped before the step
     assert clock.from_wall_ns(12_345) == before  # of another clock
+    wall -= 7200 * SECOND  # and back
+    assert clock.now_ns() == before
+    assert clock.from_wall_ns(wall - 3 * MS) == before - 3 * MS

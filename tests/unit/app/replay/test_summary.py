@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from fusiond.app.replay import summary as report
 from fusiond.estimator.solution import Mode
+from fusiond.timeline.aligner import ClockReport
 from fusiond.units import SECOND
 from tests.helpers.published import message
 
@@ -49,9 +51,9 @@ def test_source_report_adds_up() -> None:
 
 
 def summary() -> report.Summary:
-    source = report.source_report(
-        0, {"FUSED": 5, "REJECTED": 1, "TOO_OLD": 2, "DUPLICATE": 0, "INVALID": 3, "WAITING": 0}, {"no fix": 3}, None
-    )
+    outcomes = {"FUSED": 5, "REJECTED": 1, "TOO_OLD": 2, "DUPLICATE": 0, "INVALID": 3, "WAITING": 0}
+    lateness = report.TooOld(late_s=1.3, beyond_s=0.25, clock="unix")
+    source = report.source_report(0, outcomes, {"no fix": 3}, None, lateness)
     return report.Summary(
         fusiond="0",
         config="car.toml",
@@ -74,13 +76,39 @@ def test_the_text_has_what_a_reader_needs() -> None:
         "car: 1.0 s from 1970-01-01 00:00:00 UTC out of a.tlog",
         "warning: a.tlog: odd",
         "invalid of gps0.position: no fix (3)",
-        "2 came later than filter.horizon_s allows",
+        "2 came later than filter.horizon_s allows, by up to 0.25 s; a horizon longer by that would use them",
         "7 events were run again",
         "+- 3.00 m north, 4.00 m east",
     ):
         assert part in text
     assert "duplicate" not in text  # a column of nothing but zeros
     assert all(line == line.rstrip() for line in text.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("late_s", "resets", "advice"),
+    [
+        (2.5, 0, "a horizon longer by that"),
+        (1.8, 1, "a horizon longer by that"),
+        (2.5, 1, "clock fc/1/boot had jumped, and was not re-aligned yet; no horizon helps"),
+        (8.0, 0, "look for a link that stalls"),
+    ],
+)
+def test_the_advice_on_what_came_too_late_is_that_of_its_cause(late_s: float, resets: int, advice: str) -> None:
+    found = summary()
+    lateness = report.TooOld(late_s=late_s, beyond_s=late_s - 1.0, clock="fc/1/boot")
+    clock = ClockReport("least_offset", 0, 0.0, 0, resets, 0, 100)
+    source = replace(found.sources["gps0.position"], lateness=lateness)
+    text = report.text(replace(found, sources={"gps0.position": source}, clocks={"fc/1/boot": clock}))
+    (line,) = (line for line in text.splitlines() if "came later than" in line)
+    assert f"by up to {late_s - 1.0:.2f} s" in line and advice in line
+
+
+def test_steps_back_are_listed_up_to_a_number() -> None:
+    steps = [report.StepBack(at_s=10.0 * n, by_s=3600.0) for n in range(1, 9)]
+    text = report.text(replace(summary(), steps_back=steps))
+    assert "warning: at 10.0 s the receipt stamps step back by 3600.0 s: a new session begins there" in text
+    assert text.count("step back by") == report.MAX_STEPS and "and 3 more times" in text
 
 
 def test_json_reads_back() -> None:

@@ -31,7 +31,7 @@ def events() -> list[Received]:
 
 @pytest.mark.parametrize("rate_hz", [50.0, 0.5])
 def test_every_fix_is_drawn_by_its_outcome(events: list[Received], rate_hz: float) -> None:
-    trace = Trace()
+    trace = Trace(lambda: events[0].t_receive_ns)
     receipts: list[Receipt] = []
     task = ReplayTask(rate_hz, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt, receipts.append])
     replay = Replay(settings(), task)
@@ -48,7 +48,7 @@ def test_every_fix_is_drawn_by_its_outcome(events: list[Received], rate_hz: floa
 def test_it_causes_no_rewind(events: list[Received]) -> None:
     rerun = []
     for traced in (False, True):
-        trace = Trace()
+        trace = Trace(lambda: events[0].t_receive_ns)
         task = ReplayTask(50.0, on_tick=[trace.add_tick], on_receipt=[trace.add_receipt] if traced else [])
         replay = Replay(settings(), task)
         replay.run(events)

@@ -56,6 +56,13 @@ def test_truth_is_not_interpolated_outside_or_across_a_gap() -> None:
     assert [truth.at(t) is None for t in (0, SECOND, 2 * SECOND, 4 * SECOND)] == [True, False, True, False]
 
 
+def test_truth_is_read_again_where_time_steps_back() -> None:
+    samples = [HERE._replace(t_ns=n * SECOND, height_m=float(n)) for n in range(10)]
+    truth = Truth(samples)
+    heights = [found.height_m for t in (7.5, 2.5, 3.0, 2.0, 8.25) if (found := truth.at(round(t * SECOND)))]
+    assert heights == [7.5, 2.5, 3.0, 2.0, 8.25]
+
+
 def test_displacement_is_metres_on_the_ellipsoid() -> None:
     north, east = displacement(48.001, 11.001, (48.0, 11.0), 0.0)
     assert north == pytest.approx(111.2, abs=0.1)  # a thousandth of a degree of the meridian at 48 N
