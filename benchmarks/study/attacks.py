@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from benchmarks.study.recorded import (
     LOOK_S,
     Recorded,
     Watched,
+    changed,
     town,
     watch,
     write_trace,
@@ -175,11 +176,12 @@ def tampered(name: str, drive: Recorded, begin: float, seed: int, run: int) -> l
     return ATTACKS[name].tamper(drive.events, drive.start_ns + round(begin * SECOND), random)
 
 
-def attacked(name: str, seed: int, run: int, trace: bool = False) -> tuple[Watched, Found]:
-    """One attack in the drive of one run."""
+def attacked(name: str, seed: int, run: int, trace: bool = False, **keys: Any) -> tuple[Watched, Found]:
+    """One attack in the drive of one run; keys of [filter] in place of the defaults."""
     attack, drive, begin = ATTACKS[name], town(seed, run, DRIVE_S), begins(seed, run)
     end = begin + attack.seconds
-    found = watch(drive, tampered(name, drive, begin, seed, run), end + attack.after, ratios=trace)
+    events = tampered(name, drive, begin, seed, run)
+    found = watch(drive, events, end + attack.after, changed(drive.config, "filter", **keys), ratios=trace)
     return found, judged(found, attack, begin, drive.config.filter.v_max_mps)
 
 
