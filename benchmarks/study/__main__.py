@@ -41,8 +41,8 @@ PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the numbe
     "reboot": (reboot.reboot, 100),
     "attacks": (attacks.attacks, 20),
     "costs": (costs.costs, 3),
-    "gaps": (gaps.gaps, 20),
-    "mismatch": (mismatch.mismatch, 10),
+    "gaps": (gaps.gaps, 10),
+    "mismatch": (mismatch.mismatch, 6),
     "rtk": (rtk.rtk, 10),
     "rover": (rover.rover, 20),
 }
