@@ -11,6 +11,7 @@ from __future__ import annotations
 from msgspec import Struct
 
 Vector3 = tuple[float, float, float]
+FIX_3D, FIX_DGPS, FIX_FLOAT, FIX_FIXED, FIX_STATIC, FIX_PPP = 3, 4, 5, 6, 7, 8  # MAVLink's GPS_FIX_TYPE
 
 
 class ImuSample(Struct, frozen=True, gc=False):
@@ -28,6 +29,7 @@ class GnssPosition(Struct, frozen=True, gc=False):
     height: float  # m above the ellipsoid (or mean sea level, where the receiver gives nothing else)
     sigma_horizontal: float | None = None  # m, one standard deviation per axis
     sigma_vertical: float | None = None  # m
+    fix_type: int = FIX_3D
 
 
 class GnssVelocity(Struct, frozen=True, gc=False):

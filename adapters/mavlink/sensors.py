@@ -120,7 +120,7 @@ class GnssHandler:
         else:
             height = (alt_ellipsoid or alt) / 1e3
             latitude, longitude = math.radians(lat / 1e7), math.radians(lon / 1e7)
-            position = GnssPosition(latitude, longitude, height, _known(h_acc), _known(v_acc))
+            position = GnssPosition(latitude, longitude, height, _known(h_acc), _known(v_acc), fix_type)
             speed, course = vel / 1e2, math.radians(cog / 1e2)
             velocity = GnssVelocity(speed * math.cos(course), speed * math.sin(course), None, _known(vel_acc))
         decoder = self._decoder

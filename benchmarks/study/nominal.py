@@ -43,6 +43,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "height_sigma_m": 2.0,
         "velocity_sigma_mps": 0.1,
         "interval_s": 0.2,
+        "position_correlation_s": 0.0,
+        "velocity_correlation_s": 0.0,
+        "stamp_sigma_ms": 0.0,
     },
     "wheel": {"unsigned": False, "sigma_mps": 0.05, "least_mps": 0.0},
 }

@@ -14,7 +14,9 @@ from benchmarks.study.world import T0, World
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import Measurement
+from fusiond.filter.measurement import HORIZONTAL
 from fusiond.filter.motion_constraints import watch
+from fusiond.filter.observations import GNSS_POSITION
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import Outcome, Rows
 from fusiond.filter.state import (
@@ -195,6 +197,8 @@ class Ledger:
         rows = self.of(source)
         rows = rows[rows["ratio"] > 0]
         freedom = int(np.count_nonzero(rows["variance"][0] > 0)) if len(rows) else 1
+        if self.fusion.params.models[self.fusion.history.index[source]] == GNSS_POSITION:
+            freedom = HORIZONTAL  # its height is judged apart
         return seconds(rows), rows["ratio"] * self.fusion.params.gates[freedom], freedom
 
     def rejected(self, source: str) -> tuple[Array, NDArray[np.bool_]]:

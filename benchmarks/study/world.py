@@ -1,5 +1,5 @@
 """A drive that matches the filter's model exactly: the vehicle slips as configured for the non-holonomic constraint, every
-noise is white and of the configured size, biases and scale walk as configured, mount and biases are drawn at random.
+noise is of the configured size and correlation, biases and scale walk as configured, mount and biases are drawn at random.
 
 The motion is that of `fusiond.simulation`, with a slip on top: velocities sideways and down whose values at the instants
 of the constraint are independent draws, joined smoothly in between, felt by the accelerometer and carried into position.
@@ -294,7 +294,11 @@ class Sensors:
         """Of a receiver's positions (N, 3) [m] and velocities (N, 3) [m/s], north-east-down."""
         gnss = self.config.gnss[name]
         sigma = np.array([gnss.position_sigma_m, gnss.position_sigma_m, gnss.height_sigma_m])
-        position = self._noise(len(t), gnss.interval_s, gnss.position_correlation_s) * sigma
+        position = self._white(len(t))
+        if gnss.position_correlation_s:
+            slow, white = self._noise(len(t), gnss.interval_s, gnss.position_correlation_s), gnss.position_white_share
+            position = np.sqrt(white) * position + np.sqrt(1 - white) * slow
+        position *= sigma
         return position, self._noise(len(t), gnss.interval_s, gnss.velocity_correlation_s) * gnss.velocity_sigma_mps
 
     def _add(

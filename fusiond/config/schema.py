@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, get_args, get_origi
 
 from msgspec import Meta, field
 
+from fusiond import events
 from fusiond.config.outputs import Autopilot, Foxglove, GroundStation, Mcap, Prometheus, Publish, Record, Ros2, Zenoh
 from fusiond.config.sensor import INERTIAL, Sensor, Stream, delay_in_words, point_in_words, vector_in_words
 from fusiond.config.toml import Name, NotNegative, Positive, Section, Vector
@@ -159,11 +160,19 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     delay_sigma_ms: NotNegative = 0.0  # initial sigma of the delay; 0: not estimated
     velocity_delay_sigma_ms: NotNegative = 0.0  # the same, of the velocity delay
     stamp: Literal["sensor", "arrival"] = "sensor"  # "arrival": ignore the fix's stamp, use the receipt less delay_ms
+    stamp_sigma_ms: Annotated[float, Meta(ge=0, le=1000)] = 10.0  # error of that stamp and delay against the IMU's stamps
     position_sigma_m: Positive = 1.5  # horizontal, where the receiver gives none, and a lower bound to what it gives
     height_sigma_m: Positive = 3.0  # the same, vertical
+    dgps_sigma_m: Positive = 0.8  # in place of position_sigma_m, if less, while the fix type is DGPS: SBAS, corrections
+    dgps_height_sigma_m: Positive = 1.6  # and of height_sigma_m
+    float_sigma_m: Positive = 0.3  # while it is RTK float, or PPP
+    float_height_sigma_m: Positive = 0.6
+    fixed_sigma_m: Positive = 0.02  # while it is RTK fixed
+    fixed_height_sigma_m: Positive = 0.03
     velocity_sigma_mps: Positive = 0.2  # the same for the velocity, per axis
-    position_correlation_s: NotNegative = 0.0  # correlation time of position errors: dense fixes weigh less
-    velocity_correlation_s: NotNegative = 0.0  # correlation time of velocity errors
+    position_correlation_s: NotNegative = 30.0  # correlation time of the position's slow error; 0: all its errors are white
+    position_white_share: Annotated[float, Meta(ge=0.01, le=1)] = 0.2  # of its variance; the rest is the slow error's
+    velocity_correlation_s: NotNegative = 2.0  # correlation time of velocity errors: dense ones weigh less
     use_velocity: bool = True  # fuse speed and course as well
     outliers: Literal["gate", "mixture"] = "gate"  # reject them, or weight each fix by its likelihood of being one
     outlier_share: Annotated[float, Meta(gt=0, lt=0.5)] = 0.05  # of all fixes, with outliers = "mixture"
@@ -181,7 +190,6 @@ class Gnss(Sensor, frozen=True, kw_only=True):
             GnssPosition,
             self.delay_ms,
             suffix=".position",
-            correlation_s=self.position_correlation_s,
             sigma=self.position_sigma_m,
             group=self.group,
             shared_sigma=self.shared_sigma_m,
@@ -204,12 +212,26 @@ class Gnss(Sensor, frozen=True, kw_only=True):
         )
         return position, velocity
 
+    def sigmas(self, fix_type: int) -> tuple[float, float]:
+        """The least sigmas [m], horizontal and vertical, of a fix of a GPS_FIX_TYPE."""
+        least = (self.position_sigma_m, self.height_sigma_m)
+        match fix_type:
+            case events.FIX_DGPS:
+                least = (self.dgps_sigma_m, self.dgps_height_sigma_m)
+            case events.FIX_FLOAT | events.FIX_PPP:
+                least = (self.float_sigma_m, self.float_height_sigma_m)
+            case events.FIX_FIXED | events.FIX_STATIC:
+                least = (self.fixed_sigma_m, self.fixed_height_sigma_m)
+        return min(least[0], self.position_sigma_m), min(least[1], self.height_sigma_m)
+
     def messages(self) -> dict[str, float]:
         return {self.message: 1 / self.interval_s}
 
     def description(self, name: str) -> Iterator[str]:
         yield f"{self.origin()}, {STAMPS[self.stamp]}, {delay_in_words(self.delay_ms)}"
         yield f"feeds {name}.position: sigma {self.position_sigma_m:g} m, in height {self.height_sigma_m:g} m"
+        fixed, height = self.sigmas(events.FIX_FIXED)
+        yield f"while it is RTK fixed: sigma {fixed:g} m, in height {height:g} m"
         if self.use_velocity:
             delay = delay_in_words(self.delay_ms + self.velocity_delay_ms)
             yield f"feeds {name}.velocity: sigma {self.velocity_sigma_mps:g} m/s, {delay}"

@@ -39,8 +39,12 @@ from fusiond.filter.state import (
     DELAYS_ERROR,
     FIRST_VELOCITY_N,
     FIX_E,
+    FIX_SLOW_SHARE,
+    FIX_TYPE,
     FIX_VARIANCE,
     FORCE_B,
+    GNSS_ERROR,
+    GNSS_ERROR_E,
     GYRO_BIAS,
     GYRO_BIAS_B,
     HELD_FORCE_B,
@@ -63,6 +67,7 @@ from fusiond.filter.state import (
     T_CONSTRAINT,
     T_FIRST_VELOCITY,
     T_FIX,
+    T_GNSS_ERROR,
     T_IMU,
     T_POSITION,
     T_REST,
@@ -93,7 +98,8 @@ COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a ca
 
 def begin(state: FilterState) -> None:
     """Forget everything but the biases and calibrations, and start to align."""
-    state.stamps[[T, T_IMU, T_CONSTRAINT, T_STILL, T_FIRST_VELOCITY, T_FIX, T_REST, T_START, T_POSITION]] = NEVER
+    for stamp in (T, T_IMU, T_CONSTRAINT, T_STILL, T_FIRST_VELOCITY, T_FIX, T_REST, T_START, T_POSITION, T_GNSS_ERROR):
+        state.stamps[stamp] = NEVER
     state.stamps[PHASE] = ALIGNING
     state.auxiliary[:] = 0.0
     state.source_stamps[:] = NEVER
@@ -108,6 +114,8 @@ def gather(state: FilterState, row: Row, params: Parameters) -> None:
     if model == GNSS_POSITION:
         auxiliary[FIX_E] = values[gnss_position.PLACE_E]
         auxiliary[FIX_VARIANCE] = values[gnss_position.VARIANCE_HORIZONTAL : gnss_position.VARIANCE_VERTICAL + 1]
+        auxiliary[FIX_SLOW_SHARE] = params.model_parameters[source, gnss_position.SLOW_SHARE]
+        state.memory[source, FIX_TYPE] = values[gnss_position.TYPE_OF_FIX]
         stamps[T_FIX] = t_ns
         _start_by_position(state, source, params)
     elif model == GNSS_VELOCITY:
@@ -232,6 +240,7 @@ def _start(
     if verdict:
         state.stamps[HOT_START] = verdict
     state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
+    state.stamps[T_GNSS_ERROR] = state.stamps[T_FIX]
 
 
 def _first_variances(state: FilterState, stored: StoredState | None, params: Parameters) -> Array:
@@ -290,6 +299,10 @@ def _place(
     covariance[ATTITUDE, ATTITUDE] = product(to_n.T * [level, level, square(yaw_sigma)], to_n)
     for i, own in enumerate(first, GYRO_BIAS.start):
         covariance[i, i] = own
+    slow = auxiliary[FIX_SLOW_SHARE] * product(to_n.T * [horizontal, horizontal, vertical], to_n)
+    x[GNSS_ERROR_E] = 0.0
+    covariance[GNSS_ERROR, GNSS_ERROR] = slow
+    covariance[POSITION, GNSS_ERROR] = covariance[GNSS_ERROR, POSITION] = -slow
     if state.size == WIDE_SIZE:
         _tie(state, _gain(state, measured_n))
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from fusiond.filter import source_health
+from fusiond.filter import gnss_error, source_health
 from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, observe, wheel_speed
@@ -29,6 +31,7 @@ from fusiond.filter.state import (
     LAST_SPEED,
     LOWEST_SPEED,
     NEVER,
+    POSITION,
     POSITION_E,
     RESET_SOURCE,
     T_BACK,
@@ -44,6 +47,8 @@ from fusiond.filter.state import (
 from fusiond.maths.typed import Stamps, Vector, compiled
 from fusiond.maths.wgs84 import mat_ne
 
+HORIZONTAL = 2  # axes of a fix that are judged together; its height is judged apart
+DOUBT_TIME = 30.0  # s: a height that is rejected for so long is believed
 BREAK_NS = 5_000_000_000  # rejections further apart do not belong together
 OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
 SUSPECT = 6  # times gnss_reset_s, where the receiver's motion is in question
@@ -82,7 +87,7 @@ def correlation_of(model: int, values: Vector, parameter: Vector) -> float:
 
 
 @compiled
-def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
+def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0912, PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
     model, values = params.models[source], row["values"]
@@ -91,6 +96,9 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     same = source_health.arrive(memory, stamps, values, t_ns)
     remember(memory, model, values)
     seen = Observation(state.size)
+    if model == GNSS_POSITION:
+        gnss_error.carry(state, source, values, params)
+        gnss_error.note(state, source, values, params)
     if not observe(state, model, values, parameter, seen):
         return False
     m = seen.m
@@ -104,6 +112,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         learnt[a] = given[a] * factor
         row["innovation"][a] = seen.innovation[a]
         row["variance"][a] = spread[a, a] + learnt[a]
+    if model == GNSS_POSITION:
+        m = seen.m = HORIZONTAL
     weight = factor_of(stamps, model, values, parameter, t_ns)
     if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
         stamps[T_FUSED] = NEVER
@@ -127,9 +137,11 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     ratio, fused = update_projected(state, seen, params.gates[m], weight, trusted, parameter[CLUTTER], across, spread)
     row["ratio"] = memory[LAST_RATIO] = ratio
     if not fused and parameter[RESETS] >= 0 and _locked_out(state, source, t_ns, seen, params):
-        _reset(state, source, seen, int(parameter[RESETS]))
+        _reset(state, source, values, seen, params)
         source_health.begin(memory)
         fused = True
+    if model == GNSS_POSITION:
+        _fuse_height(state, source, values, factor * noisy, elapsed, trusted or fused, params)
     if fused:
         stamps[T_REJECTED] = stamps[T_SAME_ERROR] = NEVER
         stamps[T_FUSED] = t_ns
@@ -138,6 +150,33 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     elif stamps[T_REJECTED] == NEVER:
         stamps[T_REJECTED] = t_ns
     return fused
+
+
+@compiled
+def _fuse_height(
+    state: FilterState, source: int, values: Vector, stretch: float, elapsed: float, trusted: bool, params: Parameters
+) -> None:
+    """Fuse the height of a fix through a gate of its own: height and horizontal place may each be off alone. Its variance is
+    `stretch` times the configured one. While it is rejected the own height becomes uncertain, until it fits."""
+    parameter = params.model_parameters[source]
+    seen = Observation(state.size)
+    if not observe(state, GNSS_POSITION, values, parameter, seen):
+        return
+    share_noise(state, seen, parameter)
+    seen.m = 1
+    seen.jacobian[0] = seen.jacobian[2]
+    seen.innovation[0], seen.common[0] = seen.innovation[2], seen.common[2]
+    seen.variance[0] = seen.variance[2] * stretch
+    across, spread = np.empty((3, state.size)), np.empty((3, 3))
+    project(state, seen, across, spread)
+    ratio, fused = update_projected(state, seen, params.gates[1], 1.0, trusted, parameter[CLUTTER], across, spread)
+    if fused or not trusted or not ratio < math.inf:
+        return
+    grown = seen.innovation[0] * seen.innovation[0] / params.gates[1] * min(elapsed / DOUBT_TIME, 1.0)
+    down = seen.jacobian[0, POSITION]
+    for i in range(3):
+        for j in range(3):
+            state.covariance[POSITION.start + i, POSITION.start + j] += grown * (down[i] * down[j])
 
 
 @compiled
@@ -164,21 +203,24 @@ def _locked_out(state: FilterState, source: int, t_ns: int, seen: Observation, p
 
 
 @compiled
-def _reset(state: FilterState, source: int, seen: Observation, block: int) -> None:
-    """Put what a source observes where it says; `block` is the first of those error states. A barometer's is its own
-    offset: that is no jump."""
+def _reset(state: FilterState, source: int, values: Vector, seen: Observation, params: Parameters) -> None:
+    """Put what a source observes where it says. A barometer's is its own offset: that is no jump."""
+    block = int(params.model_parameters[source, RESETS])
     if block == HEIGHT_OFFSET_ERROR.start:
         _reset_offset(state, seen)
         return
-    _reset_block(state, seen, block)
+    if block == POSITION.start:
+        gnss_error.place(state, source, values, seen, params)
+    else:
+        _reset_block(state, seen, block)
     count_reset(state, ResetReason.SOURCE_RETURNED)
     state.stamps[RESET_SOURCE] = source
 
 
 @compiled
 def _reset_block(state: FilterState, seen: Observation, block: int) -> None:  # noqa: PLR0912 - loops
-    """Put position or velocity, which begin at `block` in the error state as in the nominal one, where the receiver says,
-    with the receiver's uncertainty."""
+    """Put the velocity, which begins at `block` in the error state as in the nominal one, where the receiver says, with the
+    receiver's uncertainty."""
     x, p, m = state.nominal, state.covariance, seen.m
     to_n = mat_ne(x[POSITION_E])
     half, spread = np.zeros((3, 3)), np.zeros((3, 3))

@@ -66,7 +66,7 @@ def cholesky(spread: Matrix3, variance: Vector3, factor: float, m: int, lower: M
 
 @compiled
 def project(state: FilterState, seen: Observation, across: ErrorRows3, spread: Matrix3) -> None:
-    """H P into `across` (m, n), H P H' into `spread` (m, m)."""
+    """H P into `across` (m, n), H P H' and what the axes have in common into `spread` (m, m)."""
     for a in range(seen.m):
         across[a] = 0.0
         for k in range(state.size):
@@ -74,7 +74,7 @@ def project(state: FilterState, seen: Observation, across: ErrorRows3, spread: M
                 across[a] += seen.jacobian[a, k] * state.covariance[k]
     for a in range(seen.m):
         for i in range(a + 1):
-            spread[a, i] = spread[i, a] = dot(seen.jacobian[a], across[i])
+            spread[a, i] = spread[i, a] = dot(seen.jacobian[a], across[i]) + seen.common[a] * seen.common[i]
 
 
 @compiled
@@ -186,6 +186,8 @@ def _joseph(p: Covariance, seen: Observation, factor: float, across: ErrorRows3,
                 kept[a] += -seen.jacobian[a, k] * p[k]
     for a in range(seen.m):
         kept[a] += factor * seen.variance[a] * gain[a]
+        for i in range(seen.m if seen.common[a] != 0.0 else 0):
+            kept[a] += seen.common[a] * seen.common[i] * gain[i]
     for a in range(seen.m):
         p += gain[a][:, None] * kept[a]
     mirror(p)

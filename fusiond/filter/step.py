@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 
-from fusiond.filter import heading_bank, initial_alignment, source_health
+from fusiond.filter import gnss_error, heading_bank, initial_alignment, source_health
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
@@ -248,9 +248,13 @@ def _choose(state: FilterState, row: Row, imu: Row | None, params: Parameters) -
     factor = factor_of(own, model, values, parameter, t_ns)
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
+            if model == GNSS_POSITION:
+                hypothesis = state.hypothesis(i)
+                gnss_error.carry(hypothesis, source, values, params)
             heading_bank.fuse_measurement(state, i, model, values, parameter, factor, params)
     own[T_FUSED] = t_ns
     if model == GNSS_POSITION:
+        gnss_error.note(state, source, values, params)
         stamps[T_POSITION] = t_ns
     heading_bank.collapse_if_close(state, params)
 

@@ -28,7 +28,7 @@ from fusiond.filter.state import (
 from fusiond.maths.rotation import euler, matrix, product
 from fusiond.maths.wgs84 import geodetic, mat_ne
 
-VERSION = 1
+VERSION = 2
 Variance = Annotated[float, Meta(ge=0, le=1e12)]
 Three = tuple[float, float, float]
 ThreeVariances = tuple[Variance, Variance, Variance]

@@ -12,6 +12,7 @@ from fusiond.simulation.scenario import WHEELS, Barometer, Gnss, Imu, Scenario
 from fusiond.simulation.trajectory import euler_matrix
 from fusiond.simulation.wire import BAROMETER, BUS, GNSS, IMU, LINK
 
+MIN_WHITE = 0.01  # share of a fix's variance
 MIN_NOISE = 1e-5  # a noiseless sensor still needs a sigma
 OWN_SCALE_SPEED = 10.0  # m/s, at which a wheel's own scale error is counted as noise
 OWN_SCALE_CORRELATION_S = 60.0  # such an error lasts while the vehicle keeps about its speed
@@ -114,7 +115,8 @@ def _gnss(scenario: Scenario) -> str:
     gnss = scenario.gnss
     horizontal = math.hypot(gnss.sigma_m, gnss.drift_sigma_m)
     vertical = math.hypot(gnss.height_sigma_m, gnss.height_drift_sigma_m)
-    share = (gnss.drift_sigma_m / horizontal) ** 2 if horizontal else 0.0
+    white = max((gnss.sigma_m / horizontal) ** 2, MIN_WHITE) if gnss.drift_sigma_m else 1.0
+    jitter_ms = 0.0 if gnss.stamp == "unix" else gnss.transport.jitter_ms
     return f"""\
 [gnss.{GNSS}]
 link = "{LINK}"
@@ -125,8 +127,10 @@ velocity_delay_ms = {gnss.velocity_lag_ms:g}  # how much longer before it the ve
 position_sigma_m = {max(horizontal, MIN_NOISE):.3g}  # horizontal, per axis
 height_sigma_m = {max(vertical, MIN_NOISE):.3g}
 velocity_sigma_mps = {max(gnss.velocity_sigma_mps, MIN_NOISE):.3g}  # per axis
-position_correlation_s = {share * gnss.correlation_s:.3g}  # correlation time of position errors [s]
-velocity_correlation_s = {gnss.velocity_correlation_s:g}  # of velocity errors [s]
+position_correlation_s = {gnss.correlation_s if gnss.drift_sigma_m else 0.0:.3g}  # correlation time of their slow part [s]
+position_white_share = {white:.3g}  # share of their variance that is not slow
+velocity_correlation_s = {gnss.velocity_correlation_s:g}  # correlation time of velocity errors [s]
+stamp_sigma_ms = {jitter_ms:g}  # of the fix's stamp
 interval_s = {1 / gnss.rate_hz:.6g}  # spacing of the fixes [s]
 """
 

@@ -24,5 +24,5 @@ def observed(
 ) -> Observed | None:
     """What a model observes; None where there is nothing. A number that the model leaves unwritten is not finite."""
     seen = Observation(state.size)
-    seen.innovation[:] = seen.jacobian[:] = seen.variance[:] = math.nan
+    seen.innovation[:] = seen.jacobian[:] = seen.variance[:] = seen.common[:] = math.nan
     return Observed(*seen.trimmed()) if observe(state, row, parameters, seen) else None

@@ -38,6 +38,7 @@ T0 = 1_700_000_000 * SECOND
 MUNICH = (math.radians(48.1), math.radians(11.6), 520.0)  # rad, rad, m
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
+WHITE = {"position_correlation_s": 0.0, "velocity_correlation_s": 0.0, "stamp_sigma_ms": 0.0}  # as `measurements` has it
 PULLS_AWAY_S = 3.0  # when drives that begin at rest pull away
 Curve = Callable[[Array], Array]
 
@@ -49,14 +50,14 @@ def ramp(t: Array, begin: float, length: float) -> Array:
 
 
 def config(wheels: Iterable[str] = WHEELS, **tables: dict[str, Any]) -> Config:
-    """A configuration of one IMU, one GNSS receiver and some wheels; `tables` holds keys of filter, motion, imu, gnss and
-    of all wheels (wheel)."""
+    """A configuration of one IMU, one GNSS receiver of white errors and some wheels; `tables` holds keys of filter, motion,
+    imu, gnss and of all wheels (wheel)."""
     wheel = {"bus": "bus", "message": "m", "signal": "s"} | tables.pop("wheel", {})
     raw = {
         "mavlink": {"link": {}},
         "can": {"bus": {}},
         "imu": {"imu0": {"link": "link"} | tables.pop("imu", {})},
-        "gnss": {"gps0": {"link": "link"} | tables.pop("gnss", {})},
+        "gnss": {"gps0": {"link": "link"} | WHITE | tables.pop("gnss", {})},
         "wheel": dict.fromkeys(wheels, wheel),
     }
     return msgspec.convert(raw | tables, Config)
@@ -188,7 +189,8 @@ def running_state(
     x[VELOCITY_E] = rng.normal(0.0, 10.0, 3)
     x[QUATERNION_EB] = quaternion(matrix_from_euler(*(float(a) for a in rng.uniform(-1.5, 1.5, 3))))
     root = rng.normal(0.0, 1.0, (state.size, state.size)) + 2 * np.eye(state.size)
-    scale = np.repeat([1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])[:size]
+    sigmas, widths = [1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1]
+    scale = np.repeat(sigmas, widths)[:size]
     covariance = scale[:, None] * (root @ root.T) * scale / size
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)

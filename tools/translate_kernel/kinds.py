@@ -89,7 +89,13 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "gyro_bias": FLOAT,
         "calibrations": vector("(n - CALIBRATIONS)"),
     },
-    "Observation": {"m": INT, "innovation": vector("3"), "jacobian": matrix("3", "n"), "variance": vector("3")},
+    "Observation": {
+        "m": INT,
+        "innovation": vector("3"),
+        "jacobian": matrix("3", "n"),
+        "variance": vector("3"),
+        "common": vector("3"),
+    },
     "Row": {
         "t_ns": INT,
         "sequence": INT,

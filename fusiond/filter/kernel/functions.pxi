@@ -376,6 +376,142 @@ cdef void wgs84_gravity_e(double* position_e, double* out) noexcept nogil:
     out[2] = ((-g) * sin_lat)
     return
 
+# ---------------- fusiond.filter.gnss_error
+
+cdef void gnss_error_carry(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    cdef double* parameter
+    cdef double* x
+    cdef double* p
+    cdef double kept
+    cdef double last
+    cdef int64_t i
+    cdef int _i
+    cdef double factor
+    cdef double new
+    cdef double to_n[3 * 3]
+    cdef double horizontal
+    cdef double vertical
+    cdef double late
+    cdef int64_t j
+    cdef double along
+    parameter = params.model_parameters + (source) * PARAMETERS
+    x = state.nominal
+    p = state.covariance
+    if (not (parameter[5] > 0)):
+        return
+    kept, last = 0.0, state.memory[(source) * MEMORY_SIZE + 18]
+    if ((state.stamps[5] != (<int64_t>-4611686018427387904)) and ((last == 0) or (last == values[5]))):
+        kept = portable_exp(((-((state.stamps[0] - state.stamps[5]) * 1e-09)) / parameter[5]))
+    for i in range(3):
+        x[(19 + i)] *= kept
+        for _i in range(n):
+            (p + ((18 + i)) * n)[_i] *= kept
+    for i in range(3):
+        for _i in range(n):
+            (p + (18 + i))[_i * n] *= kept
+    factor = source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9])
+    new = ((factor * parameter[7]) * (1 - (kept * kept)))
+    wgs84_mat_ne(x, to_n)
+    horizontal, vertical = (new * values[3]), (new * values[4])
+    gnss_error__add(p, 18, to_n, horizontal, horizontal, vertical)
+    late = ((new * parameter[6]) * parameter[6])
+    for i in range(3):
+        for j in range(3):
+            along = (x[(3 + i)] * x[(3 + j)])
+            p[((18 + i)) * n + (18 + j)] += (late * along)
+
+cdef void gnss_error_note(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    state.memory[(source) * MEMORY_SIZE + 18] = values[5]
+    if (params.model_parameters[(source) * PARAMETERS + 5] > 0):
+        state.stamps[5] = state.stamps[0]
+
+cdef void gnss_error_place(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef double to_n[3 * 3]
+    cdef bint slow
+    cdef double off[3]
+    cdef double variance[3]
+    cdef double common[3]
+    cdef double _t1[3]
+    cdef int _i
+    cdef int64_t a
+    cdef int64_t i
+    cdef int64_t j
+    cdef double _t2[3]
+    cdef double along[3]
+    x = state.nominal
+    p = state.covariance
+    wgs84_mat_ne(x, to_n)
+    slow = (params.model_parameters[(source) * PARAMETERS + 5] > 0)
+    memset(off, 0, 3 * sizeof(double))
+    memset(variance, 0, 3 * sizeof(double))
+    memset(common, 0, 3 * sizeof(double))
+    if slow:
+        rotation_times(to_n, x + 19, _t1)
+        for _i in range(3):
+            off[_i] = _t1[_i]
+        state.stamps[5] = (<int64_t>-4611686018427387904)
+        gnss_error_carry(state, source, values, params)
+        gnss_error_note(state, source, values, params)
+    for a in range(seen.m):
+        off[a] += seen.innovation[a]
+        variance[a], common[a] = seen.variance[a], seen.common[a]
+    for a in range(seen.m, 3):
+        off[a] = 0.0
+        for i in range(3):
+            for j in range(3):
+                variance[a] += ((to_n[(a) * 3 + i] * p[((0 + i)) * n + (0 + j)]) * to_n[(a) * 3 + j])
+    rotation_transposed_times(to_n, off, _t2)
+    for _i in range(3):
+        x[_i] += _t2[_i]
+    for i in range(3):
+        for _i in range(n):
+            (p + ((0 + i)) * n)[_i] = 0.0
+        for _i in range(n):
+            (p + (0 + i))[_i * n] = 0.0
+    gnss_error__add(p, 0, to_n, variance[0], variance[1], variance[2])
+    rotation_transposed_times(to_n, common, along)
+    for i in range(3):
+        for j in range(3):
+            p[((0 + i)) * n + (0 + j)] += (along[i] * along[j])
+    if slow:
+        gnss_error__tie(p, to_n, seen.m)
+
+cdef void gnss_error__tie(double* p, double* to_n, int64_t axes) noexcept nogil:
+    cdef double along[3 * 3]
+    cdef double across[3 * 3]
+    cdef int64_t a
+    cdef int64_t i
+    cdef int64_t j
+    cdef int64_t k
+    memset(along, 0, 3 * 3 * sizeof(double))
+    memset(across, 0, 3 * 3 * sizeof(double))
+    for a in range(axes):
+        for i in range(3):
+            for j in range(3):
+                along[(i) * 3 + j] += (to_n[(a) * 3 + i] * to_n[(a) * 3 + j])
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                across[(i) * 3 + j] += (along[(i) * 3 + k] * p[((18 + k)) * n + (18 + j)])
+    for i in range(3):
+        for j in range(3):
+            p[((0 + i)) * n + (18 + j)] = (-across[(i) * 3 + j])
+            p[((18 + j)) * n + (0 + i)] = (-across[(i) * 3 + j])
+    for i in range(3):
+        for j in range(i, 3):
+            for k in range(3):
+                p[((0 + i)) * n + (0 + j)] += (across[(i) * 3 + k] * along[(k) * 3 + j])
+            p[((0 + j)) * n + (0 + i)] = p[((0 + i)) * n + (0 + j)]
+
+cdef void gnss_error__add(double* p, int64_t block, double* to_n, double north, double east, double down) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t j
+    for i in range(3):
+        for j in range(3):
+            p[((block + i)) * n + (block + j)] += (((north * (to_n[(0) * 3 + i] * to_n[(0) * 3 + j])) + (east * (to_n[(1) * 3 + i] * to_n[(1) * 3 + j]))) + (down * (to_n[(2) * 3 + i] * to_n[(2) * 3 + j])))
+
 # ---------------- fusiond.filter.heading_bank
 
 cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double factor, double* spread) noexcept nogil:
@@ -586,8 +722,8 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     measurement_update_inject(state, mean)
     for _i in range(HYPOTHESES * BLOCK):
         state.bank[_i] = 0.0
-    state.stamps[9] = 2
-    if (state.stamps[20] == 1):
+    state.stamps[10] = 2
+    if (state.stamps[21] == 1):
         state_count_reset(state, 5)
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 3] = (<int64_t>-4611686018427387904)
@@ -629,13 +765,13 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
     if (still and (not (initial_alignment__gnss_speed(state) >= params.course_speed))):
         for _i in range(3):
             (a + 21)[_i] = (a + 15)[_i]
-        stamps[7] = t_ns
+        stamps[8] = t_ns
 
 cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
     cdef int64_t first
     cdef double north
     cdef double east
-    first = state.stamps[5]
+    first = state.stamps[6]
     if ((first == (<int64_t>-4611686018427387904)) or ((state.stamps[0] - first) > (<int64_t>3000000000))):
         return NAN
     north, east = state.auxiliary[24], state.auxiliary[(24 + 1)]
@@ -681,6 +817,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double learnt[3]
     cdef double factor
     cdef int64_t a
+    cdef int64_t _t1
     cdef double weight
     cdef int64_t companion
     cdef bint doubtful
@@ -688,11 +825,11 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef bint known
     cdef bint trusted
     cdef double noisy
-    cdef (double, bint) _t1
+    cdef (double, bint) _t2
     cdef double ratio
     cdef bint fused
-    cdef double _t2
-    cdef int64_t _t3
+    cdef double _t3
+    cdef int64_t _t4
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
     model = params.models[source]
     values = row.values
@@ -702,6 +839,9 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     elapsed = source_health_since_last(stamps, t_ns)
     same = source_health_arrive(memory, stamps, values, t_ns)
     measurement_remember(memory, model, values)
+    if (model == 0):
+        gnss_error_carry(state, source, values, params)
+        gnss_error_note(state, source, values, params)
     if (not observations_observe(state, model, values, parameter, &seen)):
         return False
     m = seen.m
@@ -713,6 +853,10 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         learnt[a] = (given[a] * factor)
         row.innovation[a] = seen.innovation[a]
         row.variance[a] = (spread[(a) * 3 + a] + learnt[a])
+    if (model == 0):
+        _t1 = 2
+        m = _t1
+        seen.m = _t1
     weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
     if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
         stamps[1] = (<int64_t>-4611686018427387904)
@@ -732,26 +876,64 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     noisy = source_health_noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = (learnt[a] * noisy)
-    _t1 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
-    ratio = _t1[0]
-    fused = _t1[1]
-    _t2 = ratio
-    row.ratio = _t2
-    memory[2] = _t2
+    _t2 = measurement_update_update_projected(state, &seen, params.gates[m], weight, trusted, parameter[12], across, spread)
+    ratio = _t2[0]
+    fused = _t2[1]
+    _t3 = ratio
+    row.ratio = _t3
+    memory[2] = _t3
     if ((not fused) and (parameter[13] >= 0) and measurement__locked_out(state, source, t_ns, &seen, params)):
-        measurement__reset(state, source, &seen, (<int64_t>(parameter[13])))
+        measurement__reset(state, source, values, &seen, params)
         source_health_begin(memory)
         fused = True
+    if (model == 0):
+        measurement__fuse_height(state, source, values, (factor * noisy), elapsed, (trusted or fused), params)
     if fused:
-        _t3 = (<int64_t>-4611686018427387904)
-        stamps[2] = _t3
-        stamps[4] = _t3
+        _t4 = (<int64_t>-4611686018427387904)
+        stamps[2] = _t4
+        stamps[4] = _t4
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     return fused
+
+cdef void measurement__fuse_height(State* state, int64_t source, double* values, double stretch, double elapsed, bint trusted, Parameters* params) noexcept nogil:
+    cdef double* parameter
+    cdef Observation seen
+    cdef int _i
+    cdef double across[3 * n]
+    cdef double spread[3 * 3]
+    cdef (double, bint) _t1
+    cdef double ratio
+    cdef bint fused
+    cdef double _t2
+    cdef double grown
+    cdef double* down
+    cdef int64_t i
+    cdef int64_t j
+    parameter = params.model_parameters + (source) * PARAMETERS
+    if (not observations_observe(state, 0, values, parameter, &seen)):
+        return
+    measurement_share_noise(state, &seen, parameter)
+    seen.m = 1
+    for _i in range(n):
+        (seen.jacobian + (0) * n)[_i] = (seen.jacobian + (2) * n)[_i]
+    seen.innovation[0], seen.common[0] = seen.innovation[2], seen.common[2]
+    seen.variance[0] = (seen.variance[2] * stretch)
+    measurement_update_project(state, &seen, across, spread)
+    _t1 = measurement_update_update_projected(state, &seen, params.gates[1], 1.0, trusted, parameter[12], across, spread)
+    ratio = _t1[0]
+    fused = _t1[1]
+    if (fused or (not trusted) or (not (ratio < INFINITY))):
+        return
+    _t2 = (elapsed / 30.0)
+    grown = (((seen.innovation[0] * seen.innovation[0]) / params.gates[1]) * (1.0 if 1.0 < _t2 else _t2))
+    down = seen.jacobian + (0) * n
+    for i in range(3):
+        for j in range(3):
+            state.covariance[((0 + i)) * n + (0 + j)] += (grown * (down[i] * down[j]))
 
 cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Observation* seen, Parameters* params) noexcept nogil:
     cdef double* memory
@@ -775,13 +957,18 @@ cdef bint measurement__locked_out(State* state, int64_t source, int64_t t_ns, Ob
         wait = (6 * wait)
     return ((t_ns - stamps[4]) >= wait)
 
-cdef void measurement__reset(State* state, int64_t source, Observation* seen, int64_t block) noexcept nogil:
-    if (block == 26):
+cdef void measurement__reset(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
+    cdef int64_t block
+    block = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 13]))
+    if (block == 29):
         measurement__reset_offset(state, seen)
         return
-    measurement__reset_block(state, seen, block)
+    if (block == 0):
+        gnss_error_place(state, source, values, seen, params)
+    else:
+        measurement__reset_block(state, seen, block)
     state_count_reset(state, 4)
-    state.stamps[19] = source
+    state.stamps[20] = source
 
 cdef void measurement__reset_block(State* state, Observation* seen, int64_t block) noexcept nogil:
     cdef double* x
@@ -838,8 +1025,8 @@ cdef void measurement__reset_offset(State* state, Observation* seen) noexcept no
     cdef int64_t k
     cdef double variance
     p = state.covariance
-    offset = 26
-    state.nominal[27] += seen.innovation[0]
+    offset = 29
+    state.nominal[30] += seen.innovation[0]
     for _i in range(n):
         (p + (offset) * n)[_i] = 0.0
     for _i in range(n):
@@ -904,7 +1091,7 @@ cdef void measurement_update_project(State* state, Observation* seen, double* ac
                 axpy(across + (a) * n, seen.jacobian[(a) * n + k], state.covariance + (k) * n)
     for a in range(seen.m):
         for i in range((a + 1)):
-            _t1 = linear_dot(seen.jacobian + (a) * n, across + (i) * n)
+            _t1 = (linear_dot(seen.jacobian + (a) * n, across + (i) * n) + (seen.common[a] * seen.common[i]))
             spread[(a) * 3 + i] = _t1
             spread[(i) * 3 + a] = _t1
 
@@ -1012,6 +1199,7 @@ cdef void measurement_update__joseph(double* p, Observation* seen, double factor
     cdef int _i
     cdef double kept[3 * n]
     cdef int64_t k
+    cdef int64_t i
     for a in range(seen.m):
         for _i in range(n):
             axpy(p + _i * n, (-(across + (a) * n)[_i]), gain + (a) * n)
@@ -1022,6 +1210,8 @@ cdef void measurement_update__joseph(double* p, Observation* seen, double factor
                 axpy(kept + (a) * n, (-seen.jacobian[(a) * n + k]), p + (k) * n)
     for a in range(seen.m):
         axpy(kept + (a) * n, (factor * seen.variance[a]), gain + (a) * n)
+        for i in range((seen.m if (seen.common[a] != 0.0) else 0)):
+            axpy(kept + (a) * n, (seen.common[a] * seen.common[i]), gain + (i) * n)
     for a in range(seen.m):
         for _i in range(n):
             axpy(p + _i * n, (gain + (a) * n)[_i], kept + (a) * n)
@@ -1149,7 +1339,7 @@ cdef void motion_constraints_watch(State* state, double* force_b, double* rate_b
     auxiliary = state.auxiliary
     smooth = ((1 - portable_exp(((-dt) / 0.08))) if (auxiliary[20] > 0) else 1.0)
     for _i in range(3):
-        (auxiliary + 36)[_i] += (smooth * (force_b[_i] - (auxiliary + 36)[_i]))
+        (auxiliary + 37)[_i] += (smooth * (force_b[_i] - (auxiliary + 37)[_i]))
     share = (1 - portable_exp(((-dt) / 0.5)))
     weight = (auxiliary[20] + (share * (1 - auxiliary[20])))
     auxiliary[20] = weight
@@ -1269,11 +1459,11 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* par
     _t1 = measurement_update_update(state, &seen, params.gates[seen.m], factor, True, 0.0)
     ratio = _t1[0]
     fused = _t1[1]
-    state.auxiliary[(32 + which)] = ratio
+    state.auxiliary[(33 + which)] = ratio
     if fused:
-        state.stamps[(11 + which)] += 1
+        state.stamps[(12 + which)] += 1
     else:
-        state.stamps[(14 + which)] += 1
+        state.stamps[(15 + which)] += 1
     return fused
 
 # ---------------- fusiond.filter.north_east_down
@@ -1346,12 +1536,12 @@ cdef bint barometric_height_observe(State* state, double* row, double* parameter
     model_begin(seen, 1)
     for _i in range(3):
         (seen.jacobian + (0) * n)[_i] = (-(to_n + (2) * 3)[_i])
-    seen.jacobian[(0) * n + 26] = 1.0
+    seen.jacobian[(0) * n + 29] = 1.0
     _t1 = wgs84_geodetic(x)
     _ = _t1[0]
     _ = _t1[1]
     height = _t1[2]
-    seen.innovation[0] = ((row[0] - height) - x[27])
+    seen.innovation[0] = ((row[0] - height) - x[30])
     seen.variance[0] = row[1]
     return True
 
@@ -1368,14 +1558,17 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     cdef double _t3[3 * 3]
     cdef int64_t i
     cdef double off_e[3]
+    cdef double slow
     cdef double _t4[3]
-    cdef double _t5
+    cdef double _t5[3]
+    cdef double _t6
+    cdef double _t7
     x = state.nominal
     wgs84_mat_ne(x, to_n)
     model_begin(seen, 3)
     delay = 0.0
     if (parameter[4] != 0.0):
-        delay = x[25]
+        delay = x[28]
         gnss_position__calibrated(state, parameter, to_n, seen, _t1)
         for _i in range(3):
             lever_e[_i] = _t1[_i]
@@ -1390,13 +1583,24 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     model_skew_rows(to_n, lever_e, (-1.0), 3, seen.jacobian, 6)
     for _i in range(3):
         off_e[_i] = (((row[_i] - x[_i]) - lever_e[_i]) + ((x + 3)[_i] * delay))
+    slow = parameter[7]
+    if (slow > 0):
+        for _i in range(3):
+            off_e[_i] -= (x + 19)[_i]
+        for i in range(3):
+            for _i in range(3):
+                (seen.jacobian + (i) * n + 18)[_i] = (to_n + (i) * 3)[_i]
     rotation_times(to_n, off_e, _t4)
     for _i in range(3):
         seen.innovation[_i] = _t4[_i]
-    _t5 = row[3]
-    seen.variance[0] = _t5
-    seen.variance[1] = _t5
-    seen.variance[2] = row[4]
+    rotation_times(to_n, x + 3, _t5)
+    _t6 = (parameter[6] * sqrt((1 - slow)))
+    for _i in range(3):
+        seen.common[_i] = (_t5[_i] * _t6)
+    _t7 = ((1 - slow) * row[3])
+    seen.variance[0] = _t7
+    seen.variance[1] = _t7
+    seen.variance[2] = ((1 - slow) * row[4])
     return True
 
 cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n, Observation* seen, double* out) noexcept nogil:
@@ -1415,22 +1619,22 @@ cdef void gnss_position__calibrated(State* state, double* lever_b, double* to_n,
     cdef double _t3[3]
     x = state.nominal
     model_mat_eb(state, rotation)
-    delay = x[25]
+    delay = x[28]
     for _i in range(3):
-        arm_b[_i] = (lever_b[_i] + (x + 22)[_i])
+        arm_b[_i] = (lever_b[_i] + (x + 25)[_i])
     model_rate_b(state, _t1)
     rotation_cross(_t1, arm_b, swing_b)
     rotation_matrix_product(to_n, rotation, turned)
     model_skew_rows(turned, arm_b, (-delay), 3, seen.jacobian, 9)
     model_mean_rate_b(state, _t2)
-    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 21)
+    model_skew_rows(turned, _t2, (-delay), 3, seen.jacobian, 24)
     for i in range(3):
         along = 0.0
         for j in range(3):
             seen.jacobian[(i) * n + (3 + j)] = (to_n[(i) * 3 + j] * (-delay))
-            seen.jacobian[(i) * n + (21 + j)] += turned[(i) * 3 + j]
+            seen.jacobian[(i) * n + (24 + j)] += turned[(i) * 3 + j]
             along += ((to_n[(i) * 3 + j] * x[(3 + j)]) + (turned[(i) * 3 + j] * swing_b[j]))
-        seen.jacobian[(i) * n + 24] = (-along)
+        seen.jacobian[(i) * n + 27] = (-along)
     for _i in range(3):
         _t3[_i] = (arm_b[_i] - (swing_b[_i] * delay))
     rotation_times(rotation, _t3, out)
@@ -1464,7 +1668,7 @@ cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Ob
         arm_b[_i] = parameter[_i]
     if (parameter[4] != 0.0):
         for _i in range(3):
-            arm_b[_i] += (x + 22)[_i]
+            arm_b[_i] += (x + 25)[_i]
     model_rate_b(state, _t2)
     rotation_cross(_t2, arm_b, _t1)
     rotation_times(rotation, _t1, swing_e)
@@ -1503,24 +1707,24 @@ cdef void gnss_velocity__gained(State* state, double* to_n, double* turned, Obse
     cdef double along
     cdef int64_t j
     x = state.nominal
-    delay = (x[25] + x[(25 + 1)])
+    delay = (x[28] + x[(28 + 1)])
     model_mat_eb(state, _t1)
     for _i in range(3):
-        _t2[_i] = ((state.auxiliary + 36)[_i] - (x + 13)[_i])
+        _t2[_i] = ((state.auxiliary + 37)[_i] - (x + 13)[_i])
     rotation_times(_t1, _t2, force_e)
     wgs84_gravity_e(x, rest_e)
     rest_e[0] += ((2 * 7.292115e-05) * x[(3 + 1)])
     rest_e[1] -= ((2 * 7.292115e-05) * x[3])
     model_mean_rate_b(state, _t3)
-    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 21)
+    model_skew_rows(turned, _t3, 1.0, seen.m, seen.jacobian, 24)
     model_skew_rows(to_n, rest_e, (-delay), seen.m, seen.jacobian, 6)
     for i in range(seen.m):
         along = 0.0
         for j in range(3):
             along += (to_n[(i) * 3 + j] * (force_e[j] + rest_e[j]))
             seen.jacobian[(i) * n + (12 + j)] = (turned[(i) * 3 + j] * delay)
-        seen.jacobian[(i) * n + 24] = (-along)
-        seen.jacobian[(i) * n + (24 + 1)] = (-along)
+        seen.jacobian[(i) * n + 27] = (-along)
+        seen.jacobian[(i) * n + (27 + 1)] = (-along)
         seen.jacobian[(i) * n + 3] += (to_n[(i) * 3 + 1] * ((2 * 7.292115e-05) * delay))
         seen.jacobian[(i) * n + (3 + 1)] -= (to_n[(i) * 3 + 0] * ((2 * 7.292115e-05) * delay))
     for _i in range(3):
@@ -1562,9 +1766,11 @@ cdef bint gnss_yaw_observe(State* state, double* row, double* parameter, Observa
 # ---------------- fusiond.filter.observations.model
 
 cdef void model_begin(Observation* seen, int64_t axes) noexcept nogil:
-    cdef int64_t a
     cdef int _i
+    cdef int64_t a
     seen.m = axes
+    for _i in range(3):
+        seen.common[_i] = 0.0
     for a in range(axes):
         for _i in range(n):
             (seen.jacobian + (a) * n)[_i] = 0.0
@@ -1581,7 +1787,7 @@ cdef void model_with_rate_noise(State* state, Observation* seen) noexcept nogil:
     cdef double* by
     for a in range(seen.m):
         by = seen.jacobian + (a) * n + 9
-        seen.variance[a] += (state.auxiliary[35] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
+        seen.variance[a] += (state.auxiliary[36] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
 
 cdef void model_mean_rate_b(State* state, double* out) noexcept nogil:
     cdef int _i
@@ -1686,10 +1892,12 @@ cdef double non_holonomic_observe_at_any_speed(State* state, double* parameter, 
 cdef void non_holonomic__observe(State* state, double* parameter, Observation* seen, double* out) noexcept nogil:
     cdef double by[3 * n]
     cdef double velocity_v[3]
-    cdef int64_t i
     cdef int _i
+    cdef int64_t i
     model_point_velocity_v(state, parameter, 3, by, velocity_v)
     seen.m = 2
+    for _i in range(3):
+        seen.common[_i] = 0.0
     for i in range(2):
         for _i in range(n):
             (seen.jacobian + (i) * n)[_i] = (by + ((1 + i)) * n)[_i]
@@ -1759,6 +1967,8 @@ cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Obs
             variance += (((100.0 * reading) * reading) * (1 - (sure * sure)))
             reading *= sure
     seen.m = 1
+    for _i in range(3):
+        seen.common[_i] = 0.0
     seen.innovation[0] = (reading - (scale * speed))
     seen.variance[0] = variance
     return True
@@ -2030,8 +2240,8 @@ cdef bint state_is_finite(State* state) noexcept nogil:
     return isfinite(total)
 
 cdef void state_count_reset(State* state, int64_t reason) noexcept nogil:
-    state.stamps[10] += 1
-    state.stamps[18] = reason
+    state.stamps[11] += 1
+    state.stamps[19] = reason
 
 # ---------------- fusiond.filter.step
 
@@ -2047,9 +2257,9 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
         row.outcome = 3
         return
     row.outcome = 0
-    if (state.stamps[9] == 1):
+    if (state.stamps[10] == 1):
         initial_alignment_gather_motion(state, row, params)
-    elif (state.stamps[9] == 3):
+    elif (state.stamps[10] == 3):
         step__choose(state, row, imu, params)
         step_guard(state)
     else:
@@ -2073,7 +2283,7 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
     cdef int64_t model
     cdef double grown
     stamps = state.stamps
-    phase = (<int64_t>(state.stamps[9]))
+    phase = (<int64_t>(state.stamps[10]))
     t_ns, model = (<int64_t>row.t_ns), (<int64_t>(params.models[(<int64_t>row.source)]))
     if ((phase == 0) or ((t_ns - stamps[0]) > params.restart_gap_ns)):
         return False
@@ -2156,7 +2366,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     frozen = (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE))
     if ((imu == NULL) or (held == (<int64_t>-4611686018427387904)) or ((imu.t_ns - held) > params.imu_gap_ns) or frozen):
         strapdown_coast(state, dt, &params.noise, motion_constraints_rests(state, params))
-        a[35] = (0.5 * 0.5)
+        a[36] = (0.5 * 0.5)
         return
     sample = imu.values
     span = (<double>((imu.t_ns - held)))
@@ -2174,7 +2384,7 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
         (a + 6)[_i] = (a[_i] + (end * force_change[_i]))
     for _i in range(3):
         (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
-    a[35] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
+    a[36] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
     strapdown_propagate(state, dt, force_b, rate_b, &params.noise)
 
 cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
@@ -2187,7 +2397,7 @@ cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept 
     stamps = state.stamps
     a = state.auxiliary
     begin = (<int64_t>(stamps[0]))
-    if ((t_ns <= begin) or (stamps[9] != 2)):
+    if ((t_ns <= begin) or (stamps[10] != 2)):
         return
     _t1 = (<int64_t>((stamps[1] + params.imu_gap_ns)))
     _t2 = (_t1 if _t1 < t_ns else t_ns)
@@ -2240,9 +2450,13 @@ cdef void step__choose(State* state, Row* row, Row* imu, Parameters* params) noe
     factor = measurement_factor_of(own, model, values, parameter, t_ns)
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
+            if (model == 0):
+                hypothesis = hypothesis_of(state, i)
+                gnss_error_carry(&hypothesis, source, values, params)
             heading_bank_fuse_measurement(state, i, model, values, parameter, factor, params)
     own[1] = t_ns
     if (model == 0):
+        gnss_error_note(state, source, values, params)
         stamps[4] = t_ns
     heading_bank_collapse_if_close(state, params)
 
@@ -2263,7 +2477,7 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     same = source_health_arrive(memory, own, row.values, t_ns)
     source_health_judge_repetition(memory, own, same, t_ns)
     step_hold(state, row.values, t_ns)
-    a[35] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
+    a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
@@ -2285,15 +2499,15 @@ cdef void step_guard(State* state) noexcept nogil:
     cdef int64_t i
     cdef int64_t resets
     cdef int64_t blown
-    if (state.stamps[9] == 3):
+    if (state.stamps[10] == 3):
         for i in range(13):
             if (state.bank[(i) * BLOCK + 0] > 0):
                 return
     elif state_is_finite(state):
         return
-    resets, blown = (<int64_t>(state.stamps[10])), (<int64_t>(state.stamps[17]))
+    resets, blown = (<int64_t>(state.stamps[11])), (<int64_t>(state.stamps[18]))
     clear_state(state)
-    state.stamps[10], state.stamps[17] = resets, (blown + 1)
+    state.stamps[11], state.stamps[18] = resets, (blown + 1)
     state_count_reset(state, 3)
 
 cdef int64_t step_place(Row* rows, int64_t begin, int64_t end, int64_t t_ns, int64_t source, int64_t sequence) noexcept nogil:

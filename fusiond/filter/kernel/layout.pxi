@@ -1,15 +1,15 @@
 # Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 cdef enum:
-    NOMINAL_SIZE = 28
-    AUXILIARY_SIZE = 39
-    MEMORY_SIZE = 18
-    STAMPS_SIZE = 21
+    NOMINAL_SIZE = 31
+    AUXILIARY_SIZE = 40
+    MEMORY_SIZE = 19
+    STAMPS_SIZE = 22
     SOURCE_STAMPS_SIZE = 6
     HYPOTHESES = 13
     CALIBRATIONS = 15
-    WIDE_SIZE = 27
-    PHASE = 9
+    WIDE_SIZE = 30
+    PHASE = 10
     CHOOSING = 3
     T = 0
     VALUES = 8
@@ -30,6 +30,7 @@ cdef struct Observation:
     double innovation[3]
     double jacobian[2 * n + WIDE_SIZE]
     double variance[3]
+    double common[3]
 
 cdef struct Row:
     int64_t t_ns

@@ -3,6 +3,6 @@
 """The compiled hot loop (kernel.pxi) for the ordinary state: see there."""
 
 cdef enum:
-    n = 18  # error states
+    n = 21  # error states
 
 include "kernel.pxi"

@@ -1,4 +1,5 @@
-"""GNSS position: the antenna's place, through the lever arm from the IMU. Groves (2013), equation 14.102."""
+"""GNSS position: the antenna's place, through the lever arm from the IMU, and the error that fixes share for a while. Groves
+(2013), equation 14.102."""
 
 from __future__ import annotations
 
@@ -28,6 +29,8 @@ from fusiond.filter.state import (
     ATTITUDE,
     DELAYS,
     DELAYS_ERROR,
+    GNSS_ERROR,
+    GNSS_ERROR_E,
     GYRO_BIAS,
     POSITION,
     POSITION_E,
@@ -42,6 +45,11 @@ from fusiond.maths.wgs84 import ecef, mat_ne
 
 PLACE_E = slice(0, 3)  # m, values
 VARIANCE_HORIZONTAL, VARIANCE_VERTICAL = 3, 4  # m^2, values
+TYPE_OF_FIX = 5  # values: GPS_FIX_TYPE
+
+STAMP_SIGMA = 6  # s, parameters
+ERROR_TIME = 5  # s, parameters: over which the slow part of the error stays the same; 0: it is all white
+SLOW_SHARE = 7  # parameters: of the variance
 
 HEIGHT_LIMITS = (-1000.0, 100_000.0)  # m: a GNSS height outside is not one
 
@@ -51,25 +59,30 @@ def parameters(gnss: Gnss) -> Array:
     row[LEVER_ARM_B] = gnss.lever_arm_m
     row[CALIBRATED] = float(calibrated(gnss))
     row[RESETS] = POSITION.start
+    row[ERROR_TIME] = gnss.position_correlation_s
+    row[SLOW_SHARE] = 1 - gnss.position_white_share if gnss.position_correlation_s > 0 else 0.0
+    row[STAMP_SIGMA] = gnss.stamp_sigma_ms * 1e-3
     return row
 
 
 def values(fix: GnssPosition, gnss: Gnss) -> tuple[float, ...]:
-    """Place (3,) earth-fixed [m], variances horizontal and vertical [m^2]: the receiver's own sigma, where it gives one,
-    but never below the configured one. Raises Unusable."""
+    """Place (3,) earth-fixed [m], variances horizontal and vertical [m^2], fix type. The sigma is the receiver's own,
+    where it gives one, but never below the configured one of the fix type. Raises Unusable."""
     within((fix.latitude,), math.pi / 2, "impossible position")
     within((fix.longitude,), 2 * math.pi, "impossible position")
     if not HEIGHT_LIMITS[0] <= fix.height <= HEIGHT_LIMITS[1]:
         raise Unusable("impossible position" if math.isfinite(fix.height) else "not finite")
-    horizontal = max(fix.sigma_horizontal or 0.0, gnss.position_sigma_m)
-    vertical = max(fix.sigma_vertical or 0.0, gnss.height_sigma_m)
+    least_horizontal, least_vertical = gnss.sigmas(fix.fix_type)
+    horizontal = max(fix.sigma_horizontal or 0.0, least_horizontal)
+    vertical = max(fix.sigma_vertical or 0.0, least_vertical)
     x, y, z = ecef(fix.latitude, fix.longitude, fix.height).tolist()
-    return x, y, z, square(horizontal), square(vertical)
+    return x, y, z, square(horizontal), square(vertical), float(fix.fix_type)
 
 
 @compiled
 def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observation) -> bool:
-    """Innovation (3,) [m], north-east-down. A delay that is a state takes the antenna back along its velocity."""
+    """Innovation (3,) [m], north-east-down: the fix less the antenna and the slow error. A delay that is a state takes the
+    antenna back along its velocity. Jitter of the stamp is an error along the velocity."""
     x = state.nominal
     to_n = mat_ne(x[POSITION_E])
     begin(seen, 3)
@@ -84,9 +97,15 @@ def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observatio
         seen.jacobian[i, POSITION] = to_n[i]
     skew_rows(to_n, lever_e, -1.0, 3, seen.jacobian, ATTITUDE.start)
     off_e = row[PLACE_E] - x[POSITION_E] - lever_e + x[VELOCITY_E] * delay
+    slow = parameter[SLOW_SHARE]
+    if slow > 0:
+        off_e -= x[GNSS_ERROR_E]
+        for i in range(3):
+            seen.jacobian[i, GNSS_ERROR] = to_n[i]
     seen.innovation[:] = times(to_n, off_e)
-    seen.variance[0] = seen.variance[1] = row[VARIANCE_HORIZONTAL]
-    seen.variance[2] = row[VARIANCE_VERTICAL]
+    seen.common[:] = times(to_n, x[VELOCITY_E]) * (parameter[STAMP_SIGMA] * math.sqrt(1 - slow))
+    seen.variance[0] = seen.variance[1] = (1 - slow) * row[VARIANCE_HORIZONTAL]
+    seen.variance[2] = (1 - slow) * row[VARIANCE_VERTICAL]
     return True
 
 

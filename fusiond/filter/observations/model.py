@@ -63,10 +63,11 @@ def within(values: tuple[float, ...], limit: float, complaint: str) -> None:
 class Observation:
     """What a model observes, on `m` axes, at most three; the rest of the memory is not used.
 
-    innovation d = z - h(x) : (3,), jacobian = d h / d error : (3, n), variance of z : (3,), independent axes.
+    innovation d = z - h(x) : (3,), jacobian = d h / d error : (3, n), variance of z : (3,), independent axes; common : (3,),
+    a sigma of all axes at once, along one direction: R = diag(variance) + common common'.
     """
 
-    __slots__ = ("innovation", "jacobian", "m", "variance")
+    __slots__ = ("common", "innovation", "jacobian", "m", "variance")
 
     def __init__(self, size: int) -> None:
         """Room for `size` error states."""
@@ -74,6 +75,7 @@ class Observation:
         self.innovation: Array = np.zeros(3)
         self.jacobian: Array = np.zeros((3, size))
         self.variance: Array = np.zeros(3)
+        self.common: Array = np.zeros(3)
 
     @classmethod
     def of(cls, innovation: Array, jacobian: Array, variance: Array) -> Observation:
@@ -90,8 +92,9 @@ class Observation:
 
 @compiled
 def begin(seen: Observation, axes: int) -> None:
-    """Make room for an observation on so many axes, with a jacobian of zeros."""
+    """Make room for an observation on so many axes, with a jacobian of zeros and nothing common."""
     seen.m = axes
+    seen.common[:] = 0.0
     for a in range(axes):
         seen.jacobian[a] = 0.0
 

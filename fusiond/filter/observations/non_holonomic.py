@@ -45,6 +45,7 @@ def _observe(state: FilterState, parameter: Vector, seen: Observation) -> Vector
     by = np.empty((3, state.size))
     velocity_v = point_velocity_v(state, parameter[LEVER_ARM_B], 3, by)
     seen.m = 2
+    seen.common[:] = 0.0
     for i in range(2):
         seen.jacobian[i] = by[1 + i]
         seen.innovation[i] = -velocity_v[1 + i]

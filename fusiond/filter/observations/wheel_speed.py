@@ -101,6 +101,7 @@ def _observe(state: FilterState, row: Vector, parameter: Vector, seen: Observati
             variance += SAME_DIRECTION * reading * reading * (1 - sure * sure)
             reading *= sure
     seen.m = 1
+    seen.common[:] = 0.0
     seen.innovation[0] = reading - scale * speed
     seen.variance[0] = variance
     return True

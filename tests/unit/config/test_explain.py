@@ -66,6 +66,7 @@ def test_each_sensor_is_described(folder: Path) -> None:
         "             noise 0.05 m/s^2/sqrt(Hz), 0.002 rad/s/sqrt(Hz)",
         "GNSS         gps0: GPS_RAW_INT of fc, by its own stamp, no delay",
         "             feeds gps0.position: sigma 1.5 m, in height 3 m",
+            "             while it is RTK fixed: sigma 0.02 m, in height 0.03 m",
         "             feeds gps0.velocity: sigma 0.2 m/s, delay 70 ms",
         "             antenna at 0.5 0 -1.25 m (forward, right, down) from the IMU",
         "wheel        left: WHEELS.L of body in km/h, no delay",

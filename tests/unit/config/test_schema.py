@@ -102,7 +102,7 @@ def test_delays_are_in_nanoseconds_and_include_the_delay_of_the_bus(config: Conf
 def test_the_errors_of_streams(config: Config) -> None:
     streams = {name: source.stream for name, source in config.streams().items()}
     position, velocity = streams["gps0.position"], streams["gps0.velocity"]
-    assert (position.correlation_s, position.sigma, position.group, position.shared_sigma) == (2.0, 1.25, "roof", 0.5)
+    assert (position.correlation_s, position.sigma, position.group, position.shared_sigma) == (0.0, 1.25, "roof", 0.5)
     assert (velocity.correlation_s, velocity.sigma, velocity.group, velocity.shared_sigma) == (3.0, 0.2, None, 0.0)
     assert (position.enabled, velocity.enabled) == (True, False)
     assert (position.companion, velocity.companion) == (".velocity", None)

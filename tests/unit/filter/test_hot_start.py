@@ -325,8 +325,8 @@ def test_whatever_is_torn_or_altered_is_found() -> None:
         from_text(text.replace(b'"at_rest": true', b'"at_rest": false'))
     with pytest.raises(StoredStateError, match="torn or altered"):
         from_text(text.replace(b'"roll"', b'"rolled"'))
-    with pytest.raises(StoredStateError, match="its version is 2, not 1"):
-        from_text(text.replace(b'"version": 1', b'"version": 2'))
+    with pytest.raises(StoredStateError, match="its version is 1, not 2"):
+        from_text(text.replace(b'"version": 2', b'"version": 1'))
 
 
 def test_it_is_for_one_vehicle_as_it_is_configured() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.events import GnssPosition, Measurement
+from fusiond.events import GnssPosition, GnssVelocity, Measurement
 from fusiond.filter.measurement_update import (
     _solve,
     cholesky,
@@ -25,10 +25,13 @@ from fusiond.filter.state import (
     ATTITUDE,
     ERROR_SIZE,
     NEVER,
+    PHASE,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
+    RUNNING,
     SCALE,
+    T_IMU,
     VELOCITY,
     VELOCITY_E,
     WHEEL_SCALE,
@@ -39,7 +42,7 @@ from fusiond.filter.strapdown import coast
 from fusiond.maths.rotation import matrix, quaternion_exp, skew
 from fusiond.maths.statistics import chi_square
 from fusiond.maths.typed import Array
-from fusiond.maths.wgs84 import geodetic
+from fusiond.maths.wgs84 import geodetic, mat_ne
 from tests.helpers.streams import T0, apply, config, running_state
 
 ALWAYS = math.inf  # a gate that lets everything pass
@@ -126,8 +129,8 @@ def test_riccati_steady_state() -> None:
 
 def ill_conditioned(rng: np.random.Generator) -> Array:
     """A covariance of condition 1e12 with eigenvectors in all directions."""
-    turn, _ = np.linalg.qr(rng.normal(size=(18, 18)))
-    covariance: Array = turn @ np.diag(np.logspace(6, -6, 18)) @ turn.T
+    turn, _ = np.linalg.qr(rng.normal(size=(ERROR_SIZE, ERROR_SIZE)))
+    covariance: Array = turn @ np.diag(np.logspace(6, -6, ERROR_SIZE)) @ turn.T
     covariance[ATTITUDE] *= 1e-3  # of angles that there are
     covariance[:, ATTITUDE] *= 1e-3
     return (covariance + covariance.T) / 2
@@ -135,21 +138,22 @@ def ill_conditioned(rng: np.random.Generator) -> Array:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_joseph_form_keeps_an_ill_conditioned_covariance_positive(compiled: bool, seed: int) -> None:
-    """A fix of 1 um on a kilometre of doubt: the short form P - K H P leaves noise above the fix's variance, of either
-    sign; the filter's form leaves that variance, and a covariance that is positive to rounding."""
+    """A speed of 1 um/s on a kilometre a second of doubt: the short form P - K H P leaves noise above its variance, of
+    either sign; the filter's form leaves that variance, and a covariance that is positive to rounding."""
     state = running_state(np.random.default_rng(seed))
     p = ill_conditioned(np.random.default_rng(seed))
     state.covariance[:] = p
-    sigma, h = 1e-6, np.eye(18)[POSITION]
+    sigma, h = 1e-6, np.eye(ERROR_SIZE)[VELOCITY]
     short = p - p @ h.T @ np.linalg.inv(h @ p @ h.T + sigma**2 * np.eye(3)) @ h @ p
-    assert np.abs(short[POSITION, POSITION] - sigma**2 * np.eye(3)).max() > sigma**2
-    settings = config(gnss={"position_sigma_m": sigma, "height_sigma_m": sigma})
+    assert np.abs(short[VELOCITY, VELOCITY] - sigma**2 * np.eye(3)).max() > sigma**2
+    settings = config(gnss={"velocity_sigma_mps": sigma})
     for k in range(1, 11):
-        fix = Measurement(T0, "gps0.position", k, T0, GnssPosition(*geodetic(state.nominal[POSITION_E])))
+        north, east, down = (mat_ne(state.nominal[POSITION_E]) @ state.nominal[VELOCITY_E]).tolist()
+        fix = Measurement(T0, "gps0.velocity", k, T0, GnssVelocity(north, east, down))
         state.source_stamps[:] = NEVER  # so that a fix at the same instant is no duplicate
         state.copy_from(apply(settings, state, [fix], compiled).history.head)
         np.testing.assert_array_equal(state.covariance, state.covariance.T)
-        seen = np.linalg.eigvalsh(state.covariance[POSITION, POSITION])
+        seen = np.linalg.eigvalsh(state.covariance[VELOCITY, VELOCITY])
         np.testing.assert_allclose(seen, sigma**2 / k, rtol=0.05)
         assert np.linalg.eigvalsh(state.covariance).min() > -np.finfo(float).eps * 1e6
 
@@ -252,8 +256,8 @@ def test_projection_and_whitening_against_matrices(m: int) -> None:
 def test_a_correction_turns_along_with_the_attitude() -> None:
     """P = M P M', with -[correction]x where M's rows of position and velocity meet its columns of attitude."""
     rng = np.random.default_rng(6)
-    state, error = running_state(rng), rng.normal(size=18)
-    turn = np.eye(18)
+    state, error = running_state(rng), rng.normal(size=ERROR_SIZE)
+    turn = np.eye(ERROR_SIZE)
     for block in (POSITION, VELOCITY):
         turn[block, ATTITUDE] = -skew(error[block])
     expected = turn @ state.covariance @ turn.T
@@ -286,3 +290,27 @@ def test_difference_is_what_inject_adds(size: int) -> None:
     assert abs(difference(moved, state)[ATTITUDE]).max() > 0
     moved.nominal[QUATERNION_EB] *= -1  # the same attitude
     np.testing.assert_allclose(difference(moved, state), error, atol=1e-8)
+
+
+def test_an_error_common_to_all_axes_is_noise_of_rank_one(compiled: bool) -> None:
+    """Fused with R = diag(variance) + common common', as the Kalman filter has it."""
+    state = running_state(np.random.default_rng(8))
+    gnss = {"stamp_sigma_ms": 100.0, "outliers": "mixture", "outlier_share": 1e-9}
+    settings = config(gnss=gnss)
+    state.stamps[T_IMU], state.stamps[PHASE] = T0, RUNNING
+    to_n = mat_ne(state.nominal[POSITION_E])
+    state.nominal[VELOCITY_E] = to_n.T @ np.array([12.0, -9.0, 0.0])  # level: the height is fused apart
+    along = to_n @ state.nominal[VELOCITY_E] * 0.1
+    noise = np.diag([2.25, 2.25, 9.0]) + np.outer(along, along)
+    p = state.covariance.copy()
+    h = np.zeros((3, ERROR_SIZE))
+    h[:, POSITION] = to_n
+    expected = p - p @ h.T @ np.linalg.inv(h @ p @ h.T + noise) @ h @ p
+    seen = Observation.of(np.zeros(3), h, np.array([2.25, 2.25, 9.0]))
+    seen.common[:] = along
+    plain = state.copy()
+    update(plain, seen, ALWAYS)
+    np.testing.assert_allclose(plain.covariance, expected, rtol=1e-7, atol=1e-10)
+    fix = Measurement(T0, "gps0.position", 1, T0, GnssPosition(*geodetic(state.nominal[POSITION_E])))
+    fused = apply(settings, state, [fix], compiled).history.head
+    np.testing.assert_allclose(fused.covariance, expected, rtol=1e-4, atol=1e-6)

@@ -28,21 +28,21 @@ from fusiond.filter.state import (
 from tests.helpers.streams import bits, running_state
 
 NOMINAL = (
-    "POSITION_E", "VELOCITY_E", "QUATERNION_EB", "GYRO_BIAS_B", "ACCEL_BIAS_B", "WHEEL_SCALE", "MOUNT", "FURTHER_SCALES",
-    "ANTENNA_B", "DELAYS", "HEIGHT_OFFSET",
+    "POSITION_E", "VELOCITY_E", "QUATERNION_EB", "GYRO_BIAS_B", "ACCEL_BIAS_B", "WHEEL_SCALE", "MOUNT", "GNSS_ERROR_E",
+    "FURTHER_SCALES", "ANTENNA_B", "DELAYS", "HEIGHT_OFFSET",
 )  # fmt: skip
 ERROR = (
-    "POSITION", "VELOCITY", "ATTITUDE", "GYRO_BIAS", "ACCEL_BIAS", "SCALE", "MOUNT_ERROR", "FURTHER_SCALES_ERROR",
-    "ANTENNA_ERROR", "DELAYS_ERROR", "HEIGHT_OFFSET_ERROR",
+    "POSITION", "VELOCITY", "ATTITUDE", "GYRO_BIAS", "ACCEL_BIAS", "SCALE", "MOUNT_ERROR", "GNSS_ERROR",
+    "FURTHER_SCALES_ERROR", "ANTENNA_ERROR", "DELAYS_ERROR", "HEIGHT_OFFSET_ERROR",
 )  # fmt: skip
-WIDTHS = (3, 3, 3, 3, 3, 1, 2, 3, 3, 2, 1)  # of the error states
+WIDTHS = (3, 3, 3, 3, 3, 1, 2, 3, 3, 3, 2, 1)  # of the error states
 
 
 def test_each_error_state_has_its_place_behind_the_one_before() -> None:
     ends = np.cumsum(WIDTHS).tolist()
     found = [getattr(state, name) for name in ERROR]
     assert found == [slice(end - width, end) for end, width in zip(ends, WIDTHS, strict=True)]
-    assert (ends[6], ends[-1]) == (ERROR_SIZE, WIDE_SIZE)
+    assert (ends[7], ends[-1]) == (ERROR_SIZE, WIDE_SIZE)
 
 
 def test_each_nominal_state_has_its_place_behind_the_one_before() -> None:

@@ -15,6 +15,8 @@ from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ATTITUDE,
+    ERROR_SIZE,
+    GNSS_ERROR,
     GYRO_BIAS,
     MOUNT_ERROR,
     PHASE,
@@ -226,8 +228,9 @@ BLOCKS = {
     "accel bias": ACCEL_BIAS,
     "scale": SCALE,
     "mount": MOUNT_ERROR,
+    "gnss error": GNSS_ERROR,
 }
-STEPS = np.repeat([100.0, 1.0, 1e-3, 1e-2, 0.1, 1e-3], 3)
+STEPS = np.repeat([100.0, 1.0, 1e-3, 1e-2, 0.1, 1e-3, 1.0], 3)
 DT = 0.01  # s
 TIGHT = {  # what the model keeps of a block to a better precision than dt^3, as a share of the block's own size
     ("velocity", "position"): 0.02,  # spherical Earth
@@ -251,7 +254,7 @@ def test_transition_against_finite_differences(kernel: AnyKernel, seed: int) -> 
         for by_name, by in BLOCKS.items():
             found, expected = modelled[to, by], true[to, by]
             share = TIGHT.get((to_name, by_name))
-            change = expected - np.eye(18)[to, by]
+            change = expected - np.eye(ERROR_SIZE)[to, by]
             tolerance = 6 * DT**3 if share is None else share * np.abs(change).max()
             np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance, err_msg=f"{to_name} by {by_name}")
 
@@ -280,7 +283,7 @@ def test_process_noise(compiled: bool) -> None:
     state, path = Path(MUNICH, 0.0).state(), Path(MUNICH, 0.0)
     make_kernel(layout, compiled).propagate(state, DT, *path.felt(0.0))
     p = state.covariance
-    expected = np.zeros((18, 18))
+    expected = np.zeros((ERROR_SIZE, ERROR_SIZE))
     for block, density in (
         (POSITION, 0.01 * DT**2 / 3),
         (VELOCITY, 0.01),
@@ -335,7 +338,7 @@ def test_pole_is_where_the_ellipsoid_says() -> None:
 def test_attitude_errors_are_small_turns_in_earth_axes() -> None:
     state = running_state(np.random.default_rng(7))
     moved, turn = state.copy(), np.array([1e-3, -2e-3, 3e-3])
-    error = np.zeros(18)
+    error = np.zeros(ERROR_SIZE)
     error[ATTITUDE] = turn
     inject(moved, error)
     expected = matrix(quaternion_exp(turn)) @ matrix(state.nominal[QUATERNION_EB])

@@ -316,15 +316,15 @@ def test_sizes() -> None:
     """A kernel is compiled for a number of error states, and takes no state of other sizes."""
     from fusiond.filter.kernel import narrow, wide  # noqa: PLC0415 - only where they were built
 
-    with pytest.raises(ValueError, match="18 error states, not 27"):
+    with pytest.raises(ValueError, match="21 error states, not 30"):
         narrow.Kernel(make_parameters(config(gnss=LEARNT)))
-    with pytest.raises(ValueError, match="27 error states, not 18"):
+    with pytest.raises(ValueError, match="30 error states, not 21"):
         wide.Kernel(make_parameters(config()))
     kernel = make_kernel(make_parameters(config()), True)
     with pytest.raises(ValueError, match="numbers"):
         kernel.predict(FilterState(2), T0)
-    with pytest.raises(ValueError, match="18 error states is needed, not 27"):
-        kernel.to_north_east_down(np.zeros(NOMINAL_SIZE), np.zeros((27, 27)))
+    with pytest.raises(ValueError, match="21 error states is needed, not 30"):
+        kernel.to_north_east_down(np.zeros(NOMINAL_SIZE), np.zeros((30, 30)))
     assert compiled_available()
     assert isinstance(make_kernel(make_parameters(config()), False), Kernel)
     assert not isinstance(make_kernel(make_parameters(config())), Kernel)

@@ -47,9 +47,10 @@ from tests.helpers.observations import Observed, observed
 from tests.helpers.streams import EARTH_RATE_E, MUNICH, running_state
 
 GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
+WHITE = msgspec.structs.replace(GNSS, position_correlation_s=0.0)
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
-STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 6, 3, 2, 1])
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1])
 BAROMETER = Barometer(link="l")
 ANTENNAS = DualAntenna(link="l", offset_deg=50.0)
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
@@ -76,6 +77,7 @@ def wheel_case(speed: float, reading: float, **changes: bool) -> Case:
 FIX = GnssPosition(*MUNICH, 1.0, 2.0)
 CASES = {
     "position": Case("gnss_position", gnss_position.values(FIX, GNSS), gnss_position.parameters(GNSS), 10.0),
+    "position, white": Case("gnss_position", gnss_position.values(FIX, WHITE), gnss_position.parameters(WHITE), 10.0),
     "velocity": Case(
         "gnss_velocity", gnss_velocity.values(GnssVelocity(5.0, 6.0, 1.0), GNSS), gnss_velocity.parameters(GNSS), 10.0
     ),
@@ -182,7 +184,7 @@ def test_position_of_the_antenna() -> None:
     row = np.array([*place, 1.0, 4.0, 0.0, 0.0, 0.0])
     seen = found(gnss_position.observe, state, row, gnss_position.parameters(GNSS))
     np.testing.assert_allclose(seen.innovation, 0.0, atol=3e-9)
-    np.testing.assert_array_equal(seen.variance, [1.0, 1.0, 4.0])
+    np.testing.assert_allclose(seen.variance, np.array([1.0, 1.0, 4.0]) * GNSS.position_white_share)
 
 
 def test_velocity_of_the_antenna() -> None:
@@ -196,11 +198,37 @@ def test_velocity_of_the_antenna() -> None:
 
 def test_sigmas_of_the_receiver_count_from_the_configured_on() -> None:
     gnss = Gnss(link="l", position_sigma_m=1.0, height_sigma_m=2.0, velocity_sigma_mps=0.1)
-    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0), gnss)[3:] == (1.0, 4.0)
-    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0, 3.0, 5.0), gnss)[3:] == (9.0, 25.0)
-    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0, 0.5, 0.0), gnss)[3:] == (1.0, 4.0)
+    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0), gnss)[3:] == (1.0, 4.0, 3.0)
+    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0, 3.0, 5.0), gnss)[3:] == (9.0, 25.0, 3.0)
+    assert gnss_position.values(GnssPosition(0.1, 0.2, 3.0, 0.5, 0.0), gnss)[3:] == (1.0, 4.0, 3.0)
     assert gnss_velocity.values(GnssVelocity(1.0, 2.0, 3.0, 0.5), gnss) == (1.0, 2.0, 3.0, 0.25, 3.0)
     assert gnss_velocity.values(GnssVelocity(1.0, 2.0), gnss) == (1.0, 2.0, 0.0, 0.1 * 0.1, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("fix_type", "least"),
+    [(2, (1.5, 3.0)), (3, (1.5, 3.0)), (4, (0.8, 1.6)), (5, (0.3, 0.6)), (6, (0.02, 0.03)), (7, (0.02, 0.03))],
+)
+def test_each_fix_type_has_its_least_sigma(fix_type: int, least: tuple[float, float]) -> None:
+    gnss = Gnss(link="l")
+    worst = GnssPosition(0.1, 0.2, 3.0, 5.0, 7.0, fix_type)
+    best = msgspec.structs.replace(worst, sigma_horizontal=0.001, sigma_vertical=0.001)
+    silent = msgspec.structs.replace(worst, sigma_horizontal=None, sigma_vertical=None)
+    for fix, sigmas in ((worst, (5.0, 7.0)), (best, least), (silent, least)):
+        assert gnss_position.values(fix, gnss)[3:] == pytest.approx((sigmas[0] ** 2, sigmas[1] ** 2, fix_type))
+    sharp = msgspec.structs.replace(gnss, position_sigma_m=0.01, height_sigma_m=0.02)
+    assert gnss_position.values(best, sharp)[3:5] == pytest.approx((1e-4, 4e-4))  # that of a single fix holds for all
+
+
+def test_jitter_of_the_stamp_is_an_error_along_the_track() -> None:
+    state = level_state()
+    velocity_n = np.array([6.0, -8.0, 0.5])
+    state.nominal[VELOCITY_E] = mat_ne(ecef(*MUNICH)).T @ velocity_n
+    seen = Observation(state.size)
+    settings = msgspec.structs.replace(GNSS, stamp_sigma_ms=20.0)
+    values = padded(gnss_position.values(FIX, settings))
+    assert gnss_position.observe(state, values, gnss_position.parameters(settings), seen)
+    np.testing.assert_allclose(seen.common, 0.02 * math.sqrt(GNSS.position_white_share) * velocity_n, rtol=1e-9)
 
 
 def test_wheel_reads_its_contact_point_with_the_scale() -> None:
