@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.study.runs import start_covariance, true_state
-from benchmarks.study.world import WHEEL_PHASE_S, World
+from benchmarks.study.world import T0, WHEEL_PHASE_S, World
 from fusiond.config.schema import Config
+from fusiond.filter import gnss_error
 from fusiond.filter.motion_constraints import NON_HOLONOMIC
 from fusiond.filter.observations import CONSTRAINTS, IMU, MODEL, MODELS
 from fusiond.filter.observations.model import Observation, with_rate_noise
@@ -23,18 +24,22 @@ from fusiond.filter.state import (
     ERROR_SIZE,
     GYRO_BIAS,
     MEAN_RATE_B,
+    NEVER,
     POSITION,
     QUATERNION_EB,
     RATE_B,
     RATE_VARIANCE,
     SCALE,
+    T_GNSS_ERROR,
     VELOCITY,
     VELOCITY_E,
+    T,
 )
 from fusiond.maths.portable import square
 from fusiond.maths.rotation import quaternion, skew
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import EARTH_RATE, MU
+from fusiond.units import nanoseconds
 
 EARTH_SKEW = skew(np.array([0.0, 0.0, EARTH_RATE]))
 
@@ -80,10 +85,10 @@ def carried(p: Array, f: Array, density: Array, dt: float) -> Array:
 
 def updated(p: Array, seen: Observation) -> Array:
     _, jacobian, variance = seen.trimmed()
-    across = p @ jacobian.T
-    gain = np.linalg.solve(jacobian @ across + np.diag(variance), across.T).T
+    across, noise = p @ jacobian.T, np.diag(variance) + np.outer(seen.common[: seen.m], seen.common[: seen.m])
+    gain = np.linalg.solve(jacobian @ across + noise, across.T).T
     keep = np.eye(len(p)) - gain @ jacobian
-    p = keep @ p @ keep.T + (gain * variance) @ gain.T
+    p = keep @ p @ keep.T + gain @ noise @ gain.T
     return np.asarray((p + p.T) / 2)
 
 
@@ -100,6 +105,7 @@ class Bound:
         if self.config.motion.non_holonomic:
             self.events += [(t, "constraint") for t in world.times(self.config.motion.interval_s, 0.0)[1:]]
         self.events.sort()
+        self.carried_ns = NEVER  # instant of the slow error of GNSS positions
 
     def run(self, looks: list[float]) -> Array:
         """Covariances (looks, n, n), each after all measurements stamped up to its time [s]."""
@@ -145,8 +151,13 @@ class Bound:
         for source, number in enumerate(self.params.models):
             if number == IMU or (number == MODEL["wheel_speed"]) != (what == "wheel"):
                 continue
-            seen = Observation(state.size)
-            is_seen = MODELS[number].observe(state, self.row(number, source), self.params.model_parameters[source], seen)
+            seen, row = Observation(state.size), self.row(number, source)
+            if number == MODEL["gnss_position"]:
+                state.covariance[:] = p
+                state.stamps[T], state.stamps[T_GNSS_ERROR] = T0 + nanoseconds(t), self.carried_ns
+                gnss_error.carry(state, source, row, self.params)
+                p, self.carried_ns = state.covariance.copy(), int(state.stamps[T])
+            is_seen = MODELS[number].observe(state, row, self.params.model_parameters[source], seen)
             assert is_seen
             with_rate_noise(state, seen)
             p = updated(p, seen)

@@ -166,9 +166,9 @@ class Gnss(Sensor, frozen=True, kw_only=True):
     dgps_sigma_m: Positive = 0.8  # in place of position_sigma_m, if less, while the fix type is DGPS: SBAS, corrections
     dgps_height_sigma_m: Positive = 1.6  # and of height_sigma_m
     float_sigma_m: Positive = 0.3  # while it is RTK float, or PPP
-    float_height_sigma_m: Positive = 0.6
+    float_height_sigma_m: Positive = 0.6  # and of height_sigma_m
     fixed_sigma_m: Positive = 0.02  # while it is RTK fixed
-    fixed_height_sigma_m: Positive = 0.03
+    fixed_height_sigma_m: Positive = 0.03  # and of height_sigma_m
     velocity_sigma_mps: Positive = 0.2  # the same for the velocity, per axis
     position_correlation_s: NotNegative = 30.0  # correlation time of the position's slow error; 0: all its errors are white
     position_white_share: Annotated[float, Meta(ge=0.01, le=1)] = 0.2  # of its variance; the rest is the slow error's

@@ -15,6 +15,7 @@ from fusiond.filter.state import (
     ACCEL_BIAS_B,
     ATTITUDE,
     CALIBRATIONS,
+    GNSS_ERROR,
     GYRO_BIAS,
     GYRO_BIAS_B,
     NEVER,
@@ -76,6 +77,9 @@ def stored_state(state: FilterState, config: Config) -> StoredState:
     latitude, longitude, height = geodetic(x[POSITION_E])
     roll, pitch, yaw = euler(product(to_n, matrix(x[QUATERNION_EB])))
     spread = product(product(to_n, covariance[POSITION, POSITION]), to_n.T)
+    calibrations, kept = x[CALIBRATIONS + 1 : state.size + 1].copy(), variances[CALIBRATIONS:].copy()
+    sky = slice(GNSS_ERROR.start - CALIBRATIONS, GNSS_ERROR.stop - CALIBRATIONS)
+    calibrations[sky] = kept[sky] = 0.0  # the next start has another sky
     turn = float(to_n[2] @ covariance[ATTITUDE, ATTITUDE] @ to_n[2])
     found = StoredState(
         version=VERSION,
@@ -95,8 +99,8 @@ def stored_state(state: FilterState, config: Config) -> StoredState:
         gyro_bias_variance=tuple(variances[GYRO_BIAS].tolist()),
         accel_bias=tuple(x[ACCEL_BIAS_B].tolist()),
         accel_bias_variance=tuple(variances[ACCEL_BIAS].tolist()),
-        calibrations=x[CALIBRATIONS + 1 : state.size + 1].tolist(),
-        calibration_variances=variances[CALIBRATIONS:].tolist(),
+        calibrations=calibrations.tolist(),
+        calibration_variances=kept.tolist(),
     )
     return msgspec.structs.replace(found, checksum=_checksum(found))
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, Measurement
 from fusiond.filter import gnss_error
 from fusiond.filter.observations import gnss_position
@@ -16,6 +17,7 @@ from fusiond.filter.observations.model import VALUES, Observation
 from fusiond.filter.parameters import Parameters, make_parameters
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
+    CALIBRATIONS,
     GNSS_ERROR,
     GNSS_ERROR_E,
     NEVER,
@@ -28,6 +30,7 @@ from fusiond.filter.state import (
     FilterState,
     T,
 )
+from fusiond.filter.stored_state import stored_state
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import geodetic, mat_ne
 from fusiond.units import SECOND
@@ -113,6 +116,13 @@ def test_without_a_correlation_time_there_is_none() -> None:
     assert head.stamps[T_GNSS_ERROR] != NEVER  # the start has placed it
     np.testing.assert_array_equal(head.nominal[GNSS_ERROR_E], 0.0)
     np.testing.assert_array_equal(head.covariance[GNSS_ERROR], 0.0)
+
+
+def test_it_is_not_stored() -> None:
+    kept = stored_state(begun(), config(gnss=GNSS))
+    sky = slice(GNSS_ERROR.start - CALIBRATIONS, GNSS_ERROR.stop - CALIBRATIONS)
+    assert kept.calibrations[sky] == kept.calibration_variances[sky] == [0.0, 0.0, 0.0]
+    assert all(kept.calibration_variances[: sky.start])
 
 
 def placed(axes: int) -> FilterState:
@@ -249,3 +259,36 @@ def test_a_height_that_stays_off_is_believed_in_the_end() -> None:
     assert counts[Outcome.REJECTED] <= 0.02 * counts.sum()
     _, _, height = geodetic(fusion.history.head.nominal[POSITION_E])
     assert height == pytest.approx(MUNICH[2] + 40.0, abs=2.0)
+
+
+def test_a_rover_has_centimetres_while_its_receiver_has_them() -> None:
+    """Single, fixed, float, fixed again, each with an error of its own that stays: no transition is a fault, the position is
+    as good as the fix soon after it, and never better than it says."""
+    truth = town(80.0)
+    rng = np.random.default_rng(1)
+    spans = ((0.0, 3, 1.0), (30.0, 6, 0.01), (50.0, 5, 0.2), (65.0, 6, 0.01))  # from second, fix type, sigma
+    off = {begin: sigma * rng.standard_normal(3) for begin, _, sigma in spans}
+    events = []
+    for event in measurements(truth):
+        payload = event.payload
+        if isinstance(payload, GnssPosition):
+            second = (event.t_ns - T0) / SECOND
+            begin, fix_type, sigma = next(span for span in reversed(spans) if second >= span[0])
+            place = truth.position_e[truth.at(second)]
+            error = off[begin] + 0.3 * sigma * rng.standard_normal(3)
+            payload = GnssPosition(*geodetic(place + mat_ne(place).T @ error), None, None, fix_type)
+        events.append(msgspec.structs.replace(event, payload=payload))
+    fusion = Fusion(config(gnss={"position_correlation_s": 30.0}))
+    looks = {20.0: 2.0, 34.0: 0.05, 49.0: 0.03, 64.0: 0.3, 69.0: 0.05, 79.0: 0.03}  # second: worst error [m]
+    for event in events:
+        fusion.fuse(event)
+        second = (event.t_ns - T0) / SECOND
+        if event.source == "imu0" and second in looks:
+            head = fusion.history.head
+            to_n = mat_ne(head.nominal[POSITION_E])
+            error = (to_n @ (head.nominal[POSITION_E] - truth.position_e[truth.at(second)]))[:2]
+            spread = (to_n @ head.covariance[POSITION, POSITION] @ to_n.T)[:2, :2]
+            assert np.linalg.norm(error) < looks[second], second
+            assert error @ np.linalg.solve(spread, error) < 13.8, second  # chi-square, 2 degrees, 99.9 %
+    counts = fusion.history.counts[fusion.history.index["gps0.position"]]
+    assert counts[Outcome.REJECTED] <= 3

@@ -173,7 +173,7 @@ def test_position_and_yaw_of_one_message_are_two_sensors() -> None:
     vehicle = Vehicle(both)
     position, yaw = vehicle.fix(fix_type=5, h_acc=700, v_acc=900, yaw=18000, hdg_acc=50_000)
     assert (position.source, yaw.source) == ("gps0.position", "yaw0")
-    assert position.payload == GnssPosition(math.radians(48.1234567), math.radians(11.5234567), 0.0, 0.7, 0.9)
+    assert position.payload == GnssPosition(math.radians(48.1234567), math.radians(11.5234567), 0.0, 0.7, 0.9, 5)
     assert yaw.payload == GnssYaw(pytest.approx(math.pi), pytest.approx(math.radians(0.5)))
     assert payloads(vehicle.fix(fix_type=4)) == [Invalid("no fix"), GnssYaw(math.pi / 2)]
     assert payloads(vehicle.fix("GPS2_RAW")) == []
