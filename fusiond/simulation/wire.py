@@ -74,17 +74,20 @@ class GnssMessages:
             if fix_type < FIX_3D:
                 yield Received(f"{GNSS}.position", sequence, *stamp, Invalid("no fix"))
                 continue
-            yield Received(f"{GNSS}.position", sequence, *stamp, self._position(*fix[:6]))
+            yield Received(f"{GNSS}.position", sequence, *stamp, self._position(fix_type, *fix[:6]))
             yield Received(f"{GNSS}.velocity", velocities, *stamp, self._velocity(*fix[6:]))
             velocities += 1
 
-    def _position(self, lat: int, lon: int, alt: int, alt_ellipsoid: int, h_acc: int, v_acc: int) -> GnssPosition:
+    def _position(
+        self, fix_type: int, lat: int, lon: int, alt: int, alt_ellipsoid: int, h_acc: int, v_acc: int
+    ) -> GnssPosition:
         return GnssPosition(
             latitude=math.radians(lat / 1e7),
             longitude=math.radians(lon / 1e7),
             height=(alt_ellipsoid or alt) / 1e3,
             sigma_horizontal=h_acc / 1e3 or None,
             sigma_vertical=v_acc / 1e3 or None,
+            fix_type=fix_type,
         )
 
     def _velocity(self, vel: int, cog: int) -> GnssVelocity:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from fusiond.events import GnssPosition
 from fusiond.maths import wgs84 as earth
 from fusiond.simulation import wgs84
 from fusiond.simulation.drive import simulate
@@ -119,6 +120,8 @@ bias_sigma_m = 0.03
         assert set(fixes.fix_type[rows]) == {kind} and set(fixes.h_acc[rows]) == {accuracy}
         assert north[rows].std() == pytest.approx(sigma, rel=0.03) and up[rows].std() == pytest.approx(2 * sigma, rel=0.03)
         biases.append(north[rows].mean() - north[t < 1000].mean())
+    told = {event.payload.fix_type for event in drive.events() if isinstance(event.payload, GnssPosition)}
+    assert told == {5, 6}
     assert biases[0] == 0 and abs(biases[1]) > 0.05 and 0.005 < abs(biases[2]) < 0.1
 
 
