@@ -147,7 +147,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     noisy = source_health.noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = learnt[a] * noisy
-    heard = not doubtful and not source_health.is_stuck(memory) and (trusted or by_rivals)
+    heard = not source_health.is_stuck(memory) and (trusted or by_rivals)
     fits = rivals.likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0
     gate, clutter, scaled = params.gates[m], parameter[CLUTTER], model == WHEEL_SPEED
     ratio, fused = update_projected(state, seen, gate, weight, trusted, clutter, across, spread, scaled)
@@ -165,7 +165,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         rivals.suspect_receiver(state, source, before, best, params)
         if model == GNSS_POSITION and not fused:
             _suspect_state(state, source, values, seen, params)
-    if trusted and heard:
+    if trusted and heard and not doubtful:
         rivals.watch_inertial(state, seen, weight, spread, fits)
     if state.stamps[ALIVE] > 0:
         rivals.decide(state, params)

@@ -1229,7 +1229,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     noisy = source_health_noisy_factor(memory)
     for a in range(m):
         seen.variance[a] = (learnt[a] * noisy)
-    heard = ((not doubtful) and (not source_health_is_stuck(memory)) and (trusted or by_rivals))
+    heard = ((not source_health_is_stuck(memory)) and (trusted or by_rivals))
     fits = (rivals_likelihood(seen.innovation, seen.variance, weight, m, spread) if heard else 0.0)
     gate, clutter, scaled = params.gates[m], parameter[12], (model == 2)
     _t2 = measurement_update_update_projected(state, &seen, gate, weight, trusted, clutter, across, spread, scaled)
@@ -1252,7 +1252,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         rivals_suspect_receiver(state, source, before, best, params)
         if ((model == 0) and (not fused)):
             measurement__suspect_state(state, source, values, &seen, params)
-    if (trusted and heard):
+    if (trusted and heard and (not doubtful)):
         rivals_watch_inertial(state, &seen, weight, spread, fits)
     if (state.stamps[22] > 0):
         rivals_decide(state, params)
