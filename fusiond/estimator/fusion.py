@@ -19,6 +19,7 @@ from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY
 from fusiond.filter.observations import IMU, MODELS
 from fusiond.filter.observations.model import Unusable, within
 from fusiond.filter.parameters import make_parameters, model_of
+from fusiond.filter.rivals import probability_of_lie
 from fusiond.filter.rows import Outcome
 from fusiond.filter.source_health import Belief, belief
 from fusiond.filter.state import (
@@ -156,7 +157,13 @@ class Fusion:
         head = self.history.head
         start = int(head.stamps[T_START])
         return {
-            source: belief(head.memory[i], head.source_stamps[i], t_ns, start if start != NEVER else t_ns)
+            source: belief(
+                head.memory[i],
+                head.source_stamps[i],
+                t_ns,
+                start if start != NEVER else t_ns,
+                probability_of_lie(head, i, self.params),
+            )
             for i, source in enumerate(self.params.sources)
         }
 

@@ -255,9 +255,8 @@ def _fuse_rivals(
                 seen.m = HORIZONTAL
             for a in range(seen.m):
                 seen.variance[a] *= factor
-            own = rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
-            if slot == rivals.INERTIAL:
-                own = rivals.fit_lie(rival, seen, weight, across, spread, own)
+            prior = rivals.fit_lie(rival, seen, across, spread) if slot == rivals.INERTIAL else 1.0
+            own = prior * rivals.likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
             ratio, _fused = update_projected(
                 rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread, model == WHEEL_SPEED
             )

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from fusiond.filter.measurement_update import CLUTTER_DENSITY, cholesky, difference, inject, project, whiten
-from fusiond.filter.observations import GNSS_POSITION, WHEEL_SPEED
+from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS, begin, distrust, odds_of_bias
@@ -167,17 +167,16 @@ def with_lie(seen: Observation, spread: Matrix3, scale: float, widened: Matrix3)
 
 
 @compiled
-def fit_lie(
-    rival: FilterState, seen: Observation, factor: float, across: ErrorRows3, spread: Matrix3, fits: float
-) -> float:
+def fit_lie(rival: FilterState, seen: Observation, across: ErrorRows3, spread: Matrix3) -> float:
     """Let the rival in which the inertial sensor lied take the lie that explains an observation best, delta = Lambda H'
     (S + H Lambda H')^-1 d, as an uncertainty of that size, if that makes it likelier and the lie is fresh. `across` and
-    `spread`, H P and H P H', become those of P + delta delta'. Returns its likelihood, which was `fits`."""
+    `spread`, H P and H P H', become those of P + delta delta'. Returns how likely
+    that is beforehand."""
     m, widened, lower, lie, off = seen.m, np.empty((3, 3)), np.empty((3, 3)), np.zeros(rival.size), np.zeros(3)
     with_lie(seen, spread, LARGEST, widened)
     solved = np.empty(3)
-    if not rival.nominal[INERTIAL_DOUBT] > FRESH or not cholesky(widened, seen.variance, factor, m, lower):
-        return fits
+    if not rival.nominal[INERTIAL_DOUBT] > FRESH or not cholesky(widened, seen.variance, 1.0, m, lower):
+        return 1.0
     for a in range(m):
         solved[a] = seen.innovation[a]
         for b in range(a):
@@ -195,16 +194,16 @@ def fit_lie(
     for a in range(m):
         for b in range(m):
             widened[a, b] = spread[a, b] + off[a] * off[b]
-    larger = LARGER * likelihood(seen.innovation, seen.variance, factor, m, widened)
-    if not larger > fits:
-        return fits
+    larger = LARGER * likelihood(seen.innovation, seen.variance, 1.0, m, widened)
+    if not larger > likelihood(seen.innovation, seen.variance, 1.0, m, spread):
+        return 1.0
     for k in range(VELOCITY.start, ACCEL_BIAS.stop):
         rival.covariance[k] += lie[k] * lie
     for k in range(GYRO_BIAS.start, ACCEL_BIAS.stop):  # it may go on, which shows as a bias
         rival.covariance[k, k] = max(rival.covariance[k, k], GOES_ON * lie_variance(k))
     mirror(rival.covariance)
     project(rival, seen, across, spread)
-    return larger
+    return LARGER
 
 
 @compiled
@@ -424,3 +423,17 @@ def mix(state: FilterState) -> None:
                 p[j] += weight * (rival.covariance[j] + (errors[slot, j] - mean[j]) * (errors[slot] - mean))
     mirror(p)
     inject(state, mean)
+
+
+def probability_of_lie(state: FilterState, source: int, params: Parameters) -> float | None:
+    """That a source lies, where rivals decide on that: of a receiver, and of the inertial sensor. None of another."""
+    weights = state.bank[:RIVALS, 0]
+    total = float(state.auxiliary[MAIN_WEIGHT] + weights.sum()) if state.stamps[ALIVE] > 0 else 1.0
+    alive = bool(state.stamps[ALIVE] > 0)
+    if source == params.imu_source:
+        return max(float(weights[INERTIAL]) / total if alive else 0.0, float(state.nominal[INERTIAL_DOUBT]))
+    if params.models[source] not in (GNSS_POSITION, GNSS_VELOCITY):
+        return None
+    if state.memory[source, EXCLUDED]:
+        return 1.0
+    return float(weights[RECEIVER]) / total if alive and position_of(source, params) == state.stamps[SUSPECT] else 0.0

@@ -327,14 +327,17 @@ def misreading(memory: Array) -> str:
     return f"it reads {ratio:.2f} times the vehicle's speed"
 
 
-def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int) -> Belief:
-    """The health of a source at `t_ns`, where the filter has run since `since_ns`.
+def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int, lies: float | None = None) -> Belief:
+    """The health of a source at `t_ns`, where the filter has run since `since_ns`; `lies` is the probability that it is
+    biased, where rival hypotheses decide on that.
 
     Absent (THEORY D2): with detection probability P_D, each expected reading that is missing has likelihood 1 - P_D.
     """
     kept = memory[BELIEF].tolist() if memory[BELIEF].any() else list(PRIOR)
-    if memory[EXCLUDED]:
-        kept = [0.0, 0.0, 1.0, 0.0]
+    if lies is not None:
+        rest = kept[0] + kept[1] + kept[3]
+        kept = [p * (1 - lies) / rest if rest > 0 else 0.0 for p in kept]
+        kept[2] = lies
     age = (t_ns - max(int(stamps[T_LAST]), since_ns)) * 1e-9
     expected = memory[INTERVAL] if memory[INTERVAL] > 0 else UNKNOWN_INTERVAL
     odds = ABSENT / (1 - ABSENT)

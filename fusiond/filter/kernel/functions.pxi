@@ -1317,6 +1317,7 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
     cdef int64_t slot
     cdef State rival
     cdef int64_t a
+    cdef double prior
     cdef double own
     cdef (double, bint) _t1
     cdef double ratio
@@ -1337,9 +1338,8 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
                 seen.m = 2
             for a in range(seen.m):
                 seen.variance[a] *= factor
-            own = rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread)
-            if (slot == 0):
-                own = rivals_fit_lie(&rival, &seen, weight, across, spread, own)
+            prior = (rivals_fit_lie(&rival, &seen, across, spread) if (slot == 0) else 1.0)
+            own = (prior * rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread))
             _t1 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread, (model == 2))
             ratio = _t1[0]
             _fused = _t1[1]
@@ -2552,7 +2552,7 @@ cdef void rivals_with_lie(Observation* seen, double* spread, double scale, doubl
             for k in range(3, 15):
                 widened[(i) * 3 + j] += (scale * ((seen.jacobian[(i) * n + k] * rivals_lie_variance(k)) * seen.jacobian[(j) * n + k]))
 
-cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, double* across, double* spread, double fits) noexcept nogil:
+cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, double* spread) noexcept nogil:
     cdef int64_t m
     cdef double widened[3 * 3]
     cdef double lower[3 * 3]
@@ -2569,8 +2569,8 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, doubl
     memset(lie, 0, n * sizeof(double))
     memset(off, 0, 3 * sizeof(double))
     rivals_with_lie(seen, spread, 100.0, widened)
-    if ((not (rival.nominal[31] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, factor, m, lower))):
-        return fits
+    if ((not (rival.nominal[31] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
+        return 1.0
     for a in range(m):
         solved[a] = seen.innovation[a]
         for b in range(a):
@@ -2588,9 +2588,9 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, doubl
     for a in range(m):
         for b in range(m):
             widened[(a) * 3 + b] = (spread[(a) * 3 + b] + (off[a] * off[b]))
-    larger = (0.3 * rivals_likelihood(seen.innovation, seen.variance, factor, m, widened))
-    if (not (larger > fits)):
-        return fits
+    larger = (0.3 * rivals_likelihood(seen.innovation, seen.variance, 1.0, m, widened))
+    if (not (larger > rivals_likelihood(seen.innovation, seen.variance, 1.0, m, spread))):
+        return 1.0
     for k in range(3, 15):
         axpy(rival.covariance + (k) * n, lie[k], lie)
     for k in range(9, 15):
@@ -2599,7 +2599,7 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double factor, doubl
         rival.covariance[(k) * n + k] = (_t2 if _t2 > _t1 else _t1)
     linear_mirror(rival.covariance)
     measurement_update_project(rival, seen, across, spread)
-    return larger
+    return 0.3
 
 cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept nogil:
     cdef int64_t _t1
