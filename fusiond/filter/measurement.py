@@ -211,7 +211,7 @@ def _judge(
         distance = 0.0
         for a in range(m):
             distance += whitened[a] * whitened[a]
-        if rivals.returns(distance, m, params):
+        if rivals.returns(state, source, distance, m, params):
             memory[EXCLUDED] = 0.0
             source_health.begin(memory)
         return

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from fusiond.filter.measurement_update import CLUTTER_DENSITY, cholesky, difference, inject, project, whiten
+from fusiond.filter.measurement_update import cholesky, difference, inject, project, whiten
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
 from fusiond.filter.parameters import Parameters
@@ -59,7 +59,6 @@ LEAD = 100.0  # odds against all others with which a rival leads, where no loss 
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
 MIN_WEIGHT = 1e-100
-HONEST_AGAIN = 0.02  # odds that a receiver that lied is right again
 MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
 LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
@@ -289,13 +288,11 @@ def suspect_receiver(state: FilterState, source: int, before: float, best: float
 
 
 @compiled
-def returns(distance: float, m: int, params: Parameters) -> bool:
-    """Whether a receiver that was found to lie is taken back, by a squared whitened innovation: it is right now rather than
-    lying by chance where it would read if it were right. Lies are uniform over a field of CLUTTER_FIELD sigmas an axis."""
-    odds = HONEST_AGAIN * exp(-min(distance, MAX_SQUARE) / 2)
-    for _a in range(m):
-        odds /= CLUTTER_DENSITY
-    return odds * params.dead_reckoning_cost >= params.spoof_cost
+def returns(state: FilterState, source: int, distance: float, m: int, params: Parameters) -> bool:
+    """Whether a source of a receiver that was found to lie is taken back, by its squared whitened innovation on `m` axes: it
+    reads what a good one does on average. A velocity comes back after its position: alone it may lie by little for long."""
+    position = position_of(source, params)
+    return distance <= m and (source == position or state.memory[position, EXCLUDED] == 0)
 
 
 @compiled
@@ -426,14 +423,9 @@ def mix(state: FilterState) -> None:
 
 
 def probability_of_lie(state: FilterState, source: int, params: Parameters) -> float | None:
-    """That a source lies, where rivals decide on that: of a receiver, and of the inertial sensor. None of another."""
-    weights = state.bank[:RIVALS, 0]
-    total = float(state.auxiliary[MAIN_WEIGHT] + weights.sum()) if state.stamps[ALIVE] > 0 else 1.0
-    alive = bool(state.stamps[ALIVE] > 0)
+    """That a source lies, as far as rivals have decided on that: of a receiver, and of the inertial sensor. None of another."""
     if source == params.imu_source:
-        return max(float(weights[INERTIAL]) / total if alive else 0.0, float(state.nominal[INERTIAL_DOUBT]))
-    if params.models[source] not in (GNSS_POSITION, GNSS_VELOCITY):
-        return None
-    if state.memory[source, EXCLUDED]:
-        return 1.0
-    return float(weights[RECEIVER]) / total if alive and position_of(source, params) == state.stamps[SUSPECT] else 0.0
+        return float(state.nominal[INERTIAL_DOUBT])
+    if params.models[source] in (GNSS_POSITION, GNSS_VELOCITY):
+        return float(state.memory[source, EXCLUDED])
+    return None

@@ -1293,7 +1293,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
         distance = 0.0
         for a in range(m):
             distance += (whitened[a] * whitened[a])
-        if rivals_returns(distance, m, params):
+        if rivals_returns(state, source, distance, m, params):
             memory[18] = 0.0
             source_health_begin(memory)
         return
@@ -2689,13 +2689,10 @@ cdef void rivals_suspect_receiver(State* state, int64_t source, double before, d
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
     rivals_suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
 
-cdef bint rivals_returns(double distance, int64_t m, Parameters* params) noexcept nogil:
-    cdef double odds
-    cdef int64_t _a
-    odds = (0.02 * portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / 2)))
-    for _a in range(m):
-        odds /= 0.025066282746310002
-    return ((odds * params.dead_reckoning_cost) >= params.spoof_cost)
+cdef bint rivals_returns(State* state, int64_t source, double distance, int64_t m, Parameters* params) noexcept nogil:
+    cdef int64_t position
+    position = rivals_position_of(source, params)
+    return ((distance <= m) and ((source == position) or (state.memory[(position) * MEMORY_SIZE + 18] == 0)))
 
 cdef int64_t rivals_position_of(int64_t source, Parameters* params) noexcept nogil:
     cdef int64_t i
