@@ -152,17 +152,18 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     gate, clutter, scaled = params.gates[m], parameter[CLUTTER], model == WHEEL_SPEED
     ratio, fused = update_projected(state, seen, gate, weight, trusted, clutter, across, spread, scaled)
     row["ratio"] = memory[LAST_RATIO] = ratio
-    best = 0.0
-    if state.stamps[ALIVE] > 0 and heard and fits > 0:
-        best = rivals.SHARE_OF_LIAR * rivals.unread(seen.variance, weight, m, spread) / fits
+    gained = source_health.odds_of_bias(memory) / before if before > 0 else 1.0
     if state.stamps[ALIVE] > 0 and heard:
-        main = fits if trusted else rivals.unread(seen.variance, weight, m, spread)
-        gained = source_health.odds_of_bias(memory) / before if model == GNSS_VELOCITY and before > 0 else 0.0
-        best = max(best, _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params))
-        if model == WHEEL_SPEED and state.bank[rivals.WHEELS, 0] > 0:
-            state.bank[rivals.WHEELS, 0] *= min(best, rivals.MAX_ODDS)
+        unread = rivals.unread(seen.variance, weight, m, spread)
+        main = fits if trusted else unread
+        chance = rivals.SHARE_OF_LIAR * unread / main if main > 0 else 1.0
+        lie = gained if by_rivals else rivals.SHARE_OF_LIAR
+        best = _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params)
+        if not ratio <= 1:
+            lie = max(lie, max(chance, best))
+        rivals.weigh_liar(state, source, lie, params)
     if by_rivals and not doubtful:
-        rivals.suspect_receiver(state, source, before, best, params)
+        rivals.suspect_receiver(state, source, params)
         if model == GNSS_POSITION and not fused:
             _suspect_state(state, source, values, seen, params)
     if trusted and heard and not doubtful:
@@ -238,8 +239,9 @@ def _fuse_rivals(
     params: Parameters,
 ) -> float:
     """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them. Where the health of a
-    receiver made it likelier by `gained` that it is biased against the main state, those that agree with it gain as much.
-    Returns the best likelihood of those that use it, over that of the main state."""
+    receiver made it likelier by `gained` that its velocity is biased against the main state, the inertial sensor's rival
+    gains as much if it agrees with it. Returns the best likelihood of those that use it, over that of the main state: a
+    lie explains no less."""
     best = 0.0
     model, parameter = params.models[source], params.model_parameters[source]
     seen = Observation(state.size)
@@ -260,11 +262,11 @@ def _fuse_rivals(
             ratio, _fused = update_projected(
                 rival, seen, params.gates[seen.m], weight, True, parameter[CLUTTER], across, spread, model == WHEEL_SPEED
             )
-            if slot == rivals.INERTIAL and ratio <= 1:
+            if slot == rivals.INERTIAL and model == GNSS_VELOCITY and ratio <= 1:
                 own = max(own, gained * main)
-            rivals.weigh(state, slot, own, main)
             if main > 0:
                 best = max(best, own / main)
+            rivals.weigh(state, slot, own, main)
     return best
 
 

@@ -270,17 +270,24 @@ def weigh(state: FilterState, slot: int, own: float, main: float) -> None:
 
 
 @compiled
-def suspect_receiver(state: FilterState, source: int, before: float, best: float, params: Parameters) -> None:
-    """Follow the health of a GNSS source (D1), whose odds of being biased were `before`: begin a rival that does without
-    the receiver, or weigh it. A liar explains what it reads no worse than any state that uses it, of which the best one has
-    `best` times the main state's likelihood."""
+def weigh_liar(state: FilterState, source: int, lie: float, params: Parameters) -> None:
+    """Weigh the rival that calls a source a liar by a reading of that, which as a lie has `lie` times the main state's
+    likelihood."""
+    slot = RECEIVER
+    if params.models[source] == WHEEL_SPEED:
+        slot = WHEELS
+    elif position_of(source, params) < 0 or state.stamps[SUSPECT] != position_of(source, params):
+        return
+    state.bank[slot, 0] *= min(lie, MAX_ODDS)
+
+
+@compiled
+def suspect_receiver(state: FilterState, source: int, params: Parameters) -> None:
+    """Begin a rival that does without a receiver, where its health (D1) says that it may be biased; and those in which the
+    state has become wrong."""
     odds = odds_of_bias(state.memory[source])
     suspect = position_of(source, params)
-    if state.bank[RECEIVER, 0] > 0:
-        if state.stamps[SUSPECT] == suspect and before > 0:
-            state.bank[RECEIVER, 0] *= min(max(odds / before, best), MAX_ODDS)
-        return
-    if odds < BEGIN or state.memory[source, EXCLUDED] != 0 or suspect < 0:
+    if odds < BEGIN or state.bank[RECEIVER, 0] > 0 or state.memory[source, EXCLUDED] != 0 or suspect < 0:
         return
     state.stamps[SUSPECT] = suspect
     open_slot(state, RECEIVER, min(odds, MAX_ODDS))

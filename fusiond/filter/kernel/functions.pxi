@@ -1171,9 +1171,12 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double ratio
     cdef bint fused
     cdef double _t3
-    cdef double best
-    cdef double main
     cdef double gained
+    cdef double unread
+    cdef double main
+    cdef double chance
+    cdef double lie
+    cdef double best
     cdef double _t4
     cdef int64_t slot
     cdef State rival
@@ -1238,18 +1241,19 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     _t3 = ratio
     row.ratio = _t3
     memory[2] = _t3
-    best = 0.0
-    if ((state.stamps[22] > 0) and heard and (fits > 0)):
-        best = ((0.1 * rivals_unread(seen.variance, weight, m, spread)) / fits)
+    gained = ((source_health_odds_of_bias(memory) / before) if (before > 0) else 1.0)
     if ((state.stamps[22] > 0) and heard):
-        main = (fits if trusted else rivals_unread(seen.variance, weight, m, spread))
-        gained = ((source_health_odds_of_bias(memory) / before) if ((model == 1) and (before > 0)) else 0.0)
-        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
-        best = (_t4 if _t4 > best else best)
-        if ((model == 2) and (state.bank[(3) * BLOCK + 0] > 0)):
-            state.bank[(3) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < best else best)
+        unread = rivals_unread(seen.variance, weight, m, spread)
+        main = (fits if trusted else unread)
+        chance = (((0.1 * unread) / main) if (main > 0) else 1.0)
+        lie = (gained if by_rivals else 0.1)
+        best = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
+        if (not (ratio <= 1)):
+            _t4 = (best if best > chance else chance)
+            lie = (_t4 if _t4 > lie else lie)
+        rivals_weigh_liar(state, source, lie, params)
     if (by_rivals and (not doubtful)):
-        rivals_suspect_receiver(state, source, before, best, params)
+        rivals_suspect_receiver(state, source, params)
         if ((model == 0) and (not fused)):
             measurement__suspect_state(state, source, values, &seen, params)
     if (trusted and heard and (not doubtful)):
@@ -1343,13 +1347,13 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
             _t1 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread, (model == 2))
             ratio = _t1[0]
             _fused = _t1[1]
-            if ((slot == 0) and (ratio <= 1)):
+            if ((slot == 0) and (model == 1) and (ratio <= 1)):
                 _t2 = (gained * main)
                 own = (_t2 if _t2 > own else own)
-            rivals_weigh(state, slot, own, main)
             if (main > 0):
                 _t3 = (own / main)
                 best = (_t3 if _t3 > best else best)
+            rivals_weigh(state, slot, own, main)
     return best
 
 cdef void measurement__fuse_height(State* state, int64_t source, double* values, double stretch, double elapsed, bint trusted, Parameters* params) noexcept nogil:
@@ -2670,20 +2674,21 @@ cdef void rivals_weigh(State* state, int64_t slot, double own, double main) noex
         _t1 = (own / main)
         state.bank[(slot) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < _t1 else _t1)
 
-cdef void rivals_suspect_receiver(State* state, int64_t source, double before, double best, Parameters* params) noexcept nogil:
+cdef void rivals_weigh_liar(State* state, int64_t source, double lie, Parameters* params) noexcept nogil:
+    cdef int64_t slot
+    slot = 1
+    if (params.models[source] == 2):
+        slot = 3
+    elif ((rivals_position_of(source, params) < 0) or (state.stamps[23] != rivals_position_of(source, params))):
+        return
+    state.bank[(slot) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < lie else lie)
+
+cdef void rivals_suspect_receiver(State* state, int64_t source, Parameters* params) noexcept nogil:
     cdef double odds
     cdef int64_t suspect
-    cdef double _t1
-    cdef double _t2
     odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
     suspect = rivals_position_of(source, params)
-    if (state.bank[(1) * BLOCK + 0] > 0):
-        if ((state.stamps[23] == suspect) and (before > 0)):
-            _t1 = (odds / before)
-            _t2 = (best if best > _t1 else _t1)
-            state.bank[(1) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < _t2 else _t2)
-        return
-    if ((odds < 0.01) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
+    if ((odds < 0.01) or (state.bank[(1) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
         return
     state.stamps[23] = suspect
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
