@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
+import numpy as np
+
 from fusiond.filter.observations.gnss_position import (
     ERROR_TIME,
     SLOW_SHARE,
@@ -22,6 +24,7 @@ from fusiond.filter.observations.gnss_position import (
     VARIANCE_HORIZONTAL,
     VARIANCE_VERTICAL,
 )
+from fusiond.filter.measurement_update import cholesky, inject
 from fusiond.filter.observations.model import NOISE_MAX, NOISE_MIN, Observation
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import noise_factor
@@ -37,10 +40,13 @@ from fusiond.filter.state import (
     FilterState,
     T,
 )
+from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
 from fusiond.maths.rotation import times, transposed_times
 from fusiond.maths.typed import Covariance, Matrix3, Vector, Vector3, compiled
 from fusiond.maths.wgs84 import mat_ne
+
+KNOWN = 1.1  # times the variance of e: the estimate of e is never taken as all there is
 
 
 @compiled
@@ -101,6 +107,45 @@ def with_whole_error(
         variance = values[VARIANCE_VERTICAL] if i == 2 else values[VARIANCE_HORIZONTAL]
         variance += square(parameter[STAMP_SIGMA] * late_n[i])
         spread[i, i] += max(share * variance - own, 0.0)
+
+
+@compiled
+def forget_prior(state: FilterState, source: int, values: Vector, params: Parameters) -> None:
+    """Take out of a state that e is N(0, Sigma), as of a receiver that may lie by any e: with the columns C = P J' of e,
+    P + C (Sigma - P_e)^-1 C' and x + C (Sigma - P_e)^-1 e, which is the information form of the same. So what the lie has
+    pulled so far goes back to where the other sources have it."""
+    parameter, p = params.model_parameters[source], state.covariance
+    if not parameter[ERROR_TIME] > 0:
+        return
+    to_n, rest = mat_ne(state.nominal[POSITION_E]), np.zeros((3, 3))
+    share = noise_factor(state.memory[source], parameter[NOISE_MIN], parameter[NOISE_MAX]) * parameter[SLOW_SHARE]
+    late = square(parameter[STAMP_SIGMA])
+    for i in range(3):
+        for j in range(3):
+            along = state.nominal[VELOCITY_E.start + i] * state.nominal[VELOCITY_E.start + j]
+            sigma = values[VARIANCE_HORIZONTAL] * (to_n[0, i] * to_n[0, j] + to_n[1, i] * to_n[1, j])
+            sigma += values[VARIANCE_VERTICAL] * (to_n[2, i] * to_n[2, j]) + late * along
+            rest[i, j] = KNOWN * share * sigma - p[GNSS_ERROR.start + i, GNSS_ERROR.start + j]
+    lower, none = np.empty((3, 3)), np.zeros(3)
+    if not cholesky(rest, none, 1.0, 3, lower):
+        return
+    columns = np.empty((3, state.size))  # L^-1 C'
+    whole = np.empty(3)
+    for a in range(3):
+        columns[a] = p[GNSS_ERROR.start + a]
+        whole[a] = state.nominal[GNSS_ERROR_E.start + a]
+        for b in range(a):
+            columns[a] += -lower[a, b] * columns[b]
+            whole[a] -= lower[a, b] * whole[b]
+        columns[a] /= lower[a, a]
+        whole[a] /= lower[a, a]
+    error = np.zeros(state.size)
+    for a in range(3):
+        error += whole[a] * columns[a]
+        for i in range(state.size):
+            p[i] += columns[a, i] * columns[a]
+    mirror(p)
+    inject(state, error)
 
 
 @compiled

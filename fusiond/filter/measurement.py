@@ -163,7 +163,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             lie = max(lie, max(chance, best))
         rivals.weigh_liar(state, source, lie, params)
     if by_rivals and not doubtful:
-        rivals.suspect_receiver(state, source, params)
+        _suspect_receiver(state, source, values, params)
         if model == GNSS_POSITION and not fused:
             _suspect_state(state, source, values, seen, params)
     if trusted and heard and not doubtful:
@@ -295,6 +295,15 @@ def _fuse_height(
     for i in range(3):
         for j in range(3):
             state.covariance[POSITION.start + i, POSITION.start + j] += grown * (down[i] * down[j])
+
+
+@compiled
+def _suspect_receiver(state: FilterState, source: int, values: Vector, params: Parameters) -> None:
+    """Begin the rival that does without a receiver where it may lie: its fixes have pulled the state no more than the rest
+    of the vehicle allows."""
+    if rivals.suspect_receiver(state, source, params) and params.models[source] == GNSS_POSITION:
+        rival = state.hypothesis(rivals.RECEIVER)
+        gnss_error.forget_prior(rival, source, values, params)
 
 
 @compiled

@@ -32,6 +32,7 @@ from fusiond.filter.state import (
     INERTIAL_ODDS,
     LAST_RATIO,
     MAIN_WEIGHT,
+    MEAN_NIS,
     POSITION,
     POSITION_E,
     RESET_SOURCE,
@@ -55,6 +56,7 @@ INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while t
 LEAST_ODDS = 1e-6  # of the inertial sensor having lied, while nothing speaks for it
 BEGIN = 0.01  # odds with which a rival begins
 END = 1e-7  # and below which it is given up
+GOOD_NIS = 1.5  # mean squared innovation per axis, in sigmas, of a receiver that does not lie
 LEAD = 100.0  # odds against all others with which a rival leads, where no loss says otherwise
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
@@ -282,24 +284,27 @@ def weigh_liar(state: FilterState, source: int, lie: float, params: Parameters) 
 
 
 @compiled
-def suspect_receiver(state: FilterState, source: int, params: Parameters) -> None:
+def suspect_receiver(state: FilterState, source: int, params: Parameters) -> bool:
     """Begin a rival that does without a receiver, where its health (D1) says that it may be biased; and those in which the
-    state has become wrong."""
+    state has become wrong. Returns whether it has begun."""
     odds = odds_of_bias(state.memory[source])
     suspect = position_of(source, params)
     if odds < BEGIN or state.bank[RECEIVER, 0] > 0 or state.memory[source, EXCLUDED] != 0 or suspect < 0:
-        return
+        return False
     state.stamps[SUSPECT] = suspect
     open_slot(state, RECEIVER, min(odds, MAX_ODDS))
     suspect_motion(state, min(odds, MAX_ODDS) / 10)
+    return state.bank[RECEIVER, 0] > 0
 
 
 @compiled
 def returns(state: FilterState, source: int, distance: float, m: int, params: Parameters) -> bool:
     """Whether a source of a receiver that was found to lie is taken back, by its squared whitened innovation on `m` axes: it
-    reads what a good one does on average. A velocity comes back after its position: alone it may lie by little for long."""
+    reads what a good one does on average. A velocity may lie by little for long: while its position is a lie, it must have
+    read so for a while."""
     position = position_of(source, params)
-    return distance <= m and (source == position or state.memory[position, EXCLUDED] == 0)
+    alone = source != position and state.memory[position, EXCLUDED] != 0
+    return distance <= m and not (alone and state.memory[source, MEAN_NIS] > GOOD_NIS)
 
 
 @compiled
@@ -353,9 +358,9 @@ def decide(state: FilterState, params: Parameters) -> None:
                 for i in range(3):
                     apart += square(rival.nominal[POSITION_E.start + i] - state.nominal[POSITION_E.start + i])
                     blurred += rival.covariance[POSITION.start + i, POSITION.start + i]
-                needed *= params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
+                needed = params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
             elif slot == RETURN:
-                needed = params.spoof_cost / params.dead_reckoning_cost
+                needed *= params.spoof_cost / params.dead_reckoning_cost
             if odds >= needed * against:
                 _lead(state, slot, params)
                 return

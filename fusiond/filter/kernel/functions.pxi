@@ -457,6 +457,62 @@ cdef void gnss_error_with_whole_error(State* state, int64_t source, double* valu
         _t1 = ((share * variance) - own)
         spread[(i) * 3 + i] += (0.0 if 0.0 > _t1 else _t1)
 
+cdef void gnss_error_forget_prior(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    cdef double* parameter
+    cdef double* p
+    cdef double to_n[3 * 3]
+    cdef double rest[3 * 3]
+    cdef double share
+    cdef double late
+    cdef int64_t i
+    cdef int64_t j
+    cdef double along
+    cdef double sigma
+    cdef double lower[3 * 3]
+    cdef double none[3]
+    cdef double columns[3 * n]
+    cdef double whole[3]
+    cdef int64_t a
+    cdef int _i
+    cdef int64_t b
+    cdef double _t1
+    cdef double error[n]
+    parameter = params.model_parameters + (source) * PARAMETERS
+    p = state.covariance
+    if (not (parameter[5] > 0)):
+        return
+    wgs84_mat_ne(state.nominal, to_n)
+    memset(rest, 0, 3 * 3 * sizeof(double))
+    share = (source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9]) * parameter[7])
+    late = portable_square(parameter[6])
+    for i in range(3):
+        for j in range(3):
+            along = (state.nominal[(3 + i)] * state.nominal[(3 + j)])
+            sigma = (values[3] * ((to_n[(0) * 3 + i] * to_n[(0) * 3 + j]) + (to_n[(1) * 3 + i] * to_n[(1) * 3 + j])))
+            sigma += ((values[4] * (to_n[(2) * 3 + i] * to_n[(2) * 3 + j])) + (late * along))
+            rest[(i) * 3 + j] = (((1.1 * share) * sigma) - p[((18 + i)) * n + (18 + j)])
+    memset(none, 0, 3 * sizeof(double))
+    if (not measurement_update_cholesky(rest, none, 1.0, 3, lower)):
+        return
+    for a in range(3):
+        for _i in range(n):
+            (columns + (a) * n)[_i] = (p + ((18 + a)) * n)[_i]
+        whole[a] = state.nominal[(19 + a)]
+        for b in range(a):
+            axpy(columns + (a) * n, (-lower[(a) * 3 + b]), columns + (b) * n)
+            whole[a] -= (lower[(a) * 3 + b] * whole[b])
+        _t1 = lower[(a) * 3 + a]
+        for _i in range(n):
+            (columns + (a) * n)[_i] /= _t1
+        whole[a] /= lower[(a) * 3 + a]
+    memset(error, 0, n * sizeof(double))
+    for a in range(3):
+        axpy(error, whole[a], columns + (a) * n)
+        for i in range(n):
+            axpy(p + (i) * n, columns[(a) * n + i], columns + (a) * n)
+    linear_mirror(p)
+    measurement_update_inject(state, error)
+
 cdef void gnss_error_place(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
     cdef double* x
     cdef double* p
@@ -1253,7 +1309,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
             lie = (_t4 if _t4 > lie else lie)
         rivals_weigh_liar(state, source, lie, params)
     if (by_rivals and (not doubtful)):
-        rivals_suspect_receiver(state, source, params)
+        measurement__suspect_receiver(state, source, values, params)
         if ((model == 0) and (not fused)):
             measurement__suspect_state(state, source, values, &seen, params)
     if (trusted and heard and (not doubtful)):
@@ -1391,6 +1447,12 @@ cdef void measurement__fuse_height(State* state, int64_t source, double* values,
     for i in range(3):
         for j in range(3):
             state.covariance[((0 + i)) * n + (0 + j)] += (grown * (down[i] * down[j]))
+
+cdef void measurement__suspect_receiver(State* state, int64_t source, double* values, Parameters* params) noexcept nogil:
+    cdef State rival
+    if (rivals_suspect_receiver(state, source, params) and (params.models[source] == 0)):
+        rival = hypothesis_of(state, 1)
+        gnss_error_forget_prior(&rival, source, values, params)
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
     cdef double odds
@@ -2683,21 +2745,24 @@ cdef void rivals_weigh_liar(State* state, int64_t source, double lie, Parameters
         return
     state.bank[(slot) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < lie else lie)
 
-cdef void rivals_suspect_receiver(State* state, int64_t source, Parameters* params) noexcept nogil:
+cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* params) noexcept nogil:
     cdef double odds
     cdef int64_t suspect
     odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
     suspect = rivals_position_of(source, params)
     if ((odds < 0.01) or (state.bank[(1) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
-        return
+        return False
     state.stamps[23] = suspect
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
     rivals_suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
+    return (state.bank[(1) * BLOCK + 0] > 0)
 
 cdef bint rivals_returns(State* state, int64_t source, double distance, int64_t m, Parameters* params) noexcept nogil:
     cdef int64_t position
+    cdef bint alone
     position = rivals_position_of(source, params)
-    return ((distance <= m) and ((source == position) or (state.memory[(position) * MEMORY_SIZE + 18] == 0)))
+    alone = ((source != position) and (state.memory[(position) * MEMORY_SIZE + 18] != 0))
+    return ((distance <= m) and (not (alone and (state.memory[(source) * MEMORY_SIZE + 19] > 1.5))))
 
 cdef int64_t rivals_position_of(int64_t source, Parameters* params) noexcept nogil:
     cdef int64_t i
@@ -2762,9 +2827,9 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
                 for i in range(3):
                     apart += portable_square((rival.nominal[(0 + i)] - state.nominal[(0 + i)]))
                     blurred += rival.covariance[((0 + i)) * n + (0 + i)]
-                needed *= ((params.dead_reckoning_cost / params.spoof_cost) * sqrt((blurred / apart)))
+                needed = ((params.dead_reckoning_cost / params.spoof_cost) * sqrt((blurred / apart)))
             elif (slot == 2):
-                needed = (params.spoof_cost / params.dead_reckoning_cost)
+                needed *= (params.spoof_cost / params.dead_reckoning_cost)
             if (odds >= (needed * against)):
                 rivals__lead(state, slot, params)
                 return
@@ -3000,7 +3065,7 @@ cdef double source_health__stretch(double* memory, int64_t m) noexcept nogil:
     for a in range(m):
         size += (memory[(8 + a)] * memory[(8 + a)])
     size = sqrt(size)
-    return ((3.0 / size) if (1e-09 < size < 3.0) else 1.0)
+    return ((2.0 / size) if (1e-09 < size < 2.0) else 1.0)
 
 cdef void source_health__follow_bias(double* memory, double* whitened, int64_t m) noexcept nogil:
     cdef double variance
