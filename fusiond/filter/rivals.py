@@ -58,6 +58,7 @@ BEGIN = 0.01  # odds with which a rival begins
 END = 1e-7  # and below which it is given up
 GOOD_NIS = 1.5  # mean squared innovation per axis, in sigmas, of a receiver that does not lie
 LEAD = 100.0  # odds against all others with which a rival leads, where no loss says otherwise
+LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, at equal losses
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
 MIN_WEIGHT = 1e-100
@@ -304,7 +305,7 @@ def returns(state: FilterState, source: int, distance: float, m: int, params: Pa
     read so for a while."""
     position = position_of(source, params)
     alone = source != position and state.memory[position, EXCLUDED] != 0
-    return distance <= m and not (alone and state.memory[source, MEAN_NIS] > GOOD_NIS)
+    return distance <= 2 * m and not (alone and state.memory[source, MEAN_NIS] > GOOD_NIS)
 
 
 @compiled
@@ -358,7 +359,7 @@ def decide(state: FilterState, params: Parameters) -> None:
                 for i in range(3):
                     apart += square(rival.nominal[POSITION_E.start + i] - state.nominal[POSITION_E.start + i])
                     blurred += rival.covariance[POSITION.start + i, POSITION.start + i]
-                needed = params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
+                needed = LEAD_BY_LOSS * params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
             elif slot == RETURN:
                 needed *= params.spoof_cost / params.dead_reckoning_cost
             if odds >= needed * against:

@@ -2762,7 +2762,7 @@ cdef bint rivals_returns(State* state, int64_t source, double distance, int64_t 
     cdef bint alone
     position = rivals_position_of(source, params)
     alone = ((source != position) and (state.memory[(position) * MEMORY_SIZE + 18] != 0))
-    return ((distance <= m) and (not (alone and (state.memory[(source) * MEMORY_SIZE + 19] > 1.5))))
+    return ((distance <= (2 * m)) and (not (alone and (state.memory[(source) * MEMORY_SIZE + 19] > 1.5))))
 
 cdef int64_t rivals_position_of(int64_t source, Parameters* params) noexcept nogil:
     cdef int64_t i
@@ -2827,7 +2827,7 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
                 for i in range(3):
                     apart += portable_square((rival.nominal[(0 + i)] - state.nominal[(0 + i)]))
                     blurred += rival.covariance[((0 + i)) * n + (0 + i)]
-                needed = ((params.dead_reckoning_cost / params.spoof_cost) * sqrt((blurred / apart)))
+                needed = (((10.0 * params.dead_reckoning_cost) / params.spoof_cost) * sqrt((blurred / apart)))
             elif (slot == 2):
                 needed *= (params.spoof_cost / params.dead_reckoning_cost)
             if (odds >= (needed * against)):
