@@ -158,7 +158,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         main = fits if trusted else unread
         chance = rivals.SHARE_OF_LIAR * unread / main if main > 0 else 1.0
         lie = gained if by_rivals else rivals.SHARE_OF_LIAR
-        best = _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params)
+        best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params)
+        lie = max(lie, returned)
         if not ratio <= 1:
             lie = max(lie, max(chance, best))
         rivals.weigh_liar(state, source, lie, params)
@@ -237,12 +238,12 @@ def _fuse_rivals(
     main: float,
     gained: float,
     params: Parameters,
-) -> float:
+) -> tuple[float, float]:
     """Weigh the rivals by a reading, whose likelihood under the main state is `main`, and update them. Where the health of a
     receiver made it likelier by `gained` that its velocity is biased against the main state, the inertial sensor's rival
-    gains as much if it agrees with it. Returns the best likelihood of those that use it, over that of the main state: a
-    lie explains no less."""
-    best = 0.0
+    gains as much if it agrees with it. Returns the best likelihood of those that use it, and that of the one in which the
+    receiver is right, over that of the main state: a lie explains no less."""
+    best = returned = 0.0
     model, parameter = params.models[source], params.model_parameters[source]
     seen = Observation(state.size)
     across, spread = np.empty((3, state.size)), np.empty((3, 3))
@@ -266,8 +267,10 @@ def _fuse_rivals(
                 own = max(own, gained * main)
             if main > 0:
                 best = max(best, own / main)
+                if slot == rivals.RETURN and state.memory[source, EXCLUDED] == 0:
+                    returned = own / main
             rivals.weigh(state, slot, own, main)
-    return best
+    return best, returned
 
 
 @compiled

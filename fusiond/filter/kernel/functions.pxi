@@ -1232,8 +1232,10 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double main
     cdef double chance
     cdef double lie
+    cdef (double, double) _t4
     cdef double best
-    cdef double _t4
+    cdef double returned
+    cdef double _t5
     cdef int64_t slot
     cdef State rival
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
@@ -1303,10 +1305,13 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         main = (fits if trusted else unread)
         chance = (((0.1 * unread) / main) if (main > 0) else 1.0)
         lie = (gained if by_rivals else 0.1)
-        best = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
+        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
+        best = _t4[0]
+        returned = _t4[1]
+        lie = (returned if returned > lie else lie)
         if (not (ratio <= 1)):
-            _t4 = (best if best > chance else chance)
-            lie = (_t4 if _t4 > lie else lie)
+            _t5 = (best if best > chance else chance)
+            lie = (_t5 if _t5 > lie else lie)
         rivals_weigh_liar(state, source, lie, params)
     if (by_rivals and (not doubtful)):
         measurement__suspect_receiver(state, source, values, params)
@@ -1367,8 +1372,10 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     elif gnss:
         source_health_look(memory, whitened, m, same)
 
-cdef double measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, double gained, Parameters* params) noexcept nogil:
+cdef (double, double) measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, double gained, Parameters* params) noexcept nogil:
+    cdef double _t1
     cdef double best
+    cdef double returned
     cdef int64_t model
     cdef double* parameter
     cdef Observation seen
@@ -1379,12 +1386,14 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
     cdef int64_t a
     cdef double prior
     cdef double own
-    cdef (double, bint) _t1
+    cdef (double, bint) _t2
     cdef double ratio
     cdef bint _fused
-    cdef double _t2
     cdef double _t3
-    best = 0.0
+    cdef double _t4
+    _t1 = 0.0
+    best = _t1
+    returned = _t1
     model = params.models[source]
     parameter = params.model_parameters + (source) * PARAMETERS
     for slot in range(4):
@@ -1400,17 +1409,19 @@ cdef double measurement__fuse_rivals(State* state, int64_t source, double* value
                 seen.variance[a] *= factor
             prior = (rivals_fit_lie(&rival, &seen, across, spread) if (slot == 0) else 1.0)
             own = (prior * rivals_likelihood(seen.innovation, seen.variance, weight, seen.m, spread))
-            _t1 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread, (model == 2))
-            ratio = _t1[0]
-            _fused = _t1[1]
+            _t2 = measurement_update_update_projected(&rival, &seen, params.gates[seen.m], weight, True, parameter[12], across, spread, (model == 2))
+            ratio = _t2[0]
+            _fused = _t2[1]
             if ((slot == 0) and (model == 1) and (ratio <= 1)):
-                _t2 = (gained * main)
-                own = (_t2 if _t2 > own else own)
+                _t3 = (gained * main)
+                own = (_t3 if _t3 > own else own)
             if (main > 0):
-                _t3 = (own / main)
-                best = (_t3 if _t3 > best else best)
+                _t4 = (own / main)
+                best = (_t4 if _t4 > best else best)
+                if ((slot == 2) and (state.memory[(source) * MEMORY_SIZE + 18] == 0)):
+                    returned = (own / main)
             rivals_weigh(state, slot, own, main)
-    return best
+    return (best, returned)
 
 cdef void measurement__fuse_height(State* state, int64_t source, double* values, double stretch, double elapsed, bint trusted, Parameters* params) noexcept nogil:
     cdef double* parameter
