@@ -8,7 +8,7 @@ import numpy as np
 
 from fusiond.filter import gnss_error, rivals, source_health
 from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
-from fusiond.filter.motion_constraints import carried, disputed, is_carried
+from fusiond.filter.motion_constraints import carried, disputed, is_carried, rests
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, gnss_position, observe, wheel_speed
 from fusiond.filter.observations.gnss_velocity import lowest_speed
 from fusiond.filter.observations.model import (
@@ -36,7 +36,6 @@ from fusiond.filter.state import (
     LOWEST_SPEED,
     NEVER,
     POSITION,
-    POSITION_E,
     STATE_DOUBT,
     SUSPECT,
     T_FUSED,
@@ -46,7 +45,6 @@ from fusiond.filter.state import (
     FilterState,
 )
 from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
-from fusiond.maths.wgs84 import mat_ne
 
 HORIZONTAL = 2  # axes of a fix that are judged together; its height is judged apart
 DOUBT_TIME = 30.0  # s: a height that is rejected for so long is believed
@@ -131,7 +129,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
         stamps[T_FUSED] = NEVER
         source_health.begin(memory)
-    by_rivals = model == GNSS_POSITION or model == GNSS_VELOCITY
+    by_rivals = model in (GNSS_POSITION, GNSS_VELOCITY)
     doubtful = disputed(state, source if model == GNSS_VELOCITY else int(parameter[COMPANION]), params)
     before = source_health.odds_of_bias(memory)
     if not doubtful:
@@ -167,7 +165,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, shared, params)
         lie = max(lie, returned)
         if not ratio <= 1:
-            lie = max(lie, max(chance, best))
+            lie = max(lie, max(chance, best))  # noqa: PLW3301 - of two, for the kernel
         rivals.weigh_liar(state, source, lie, params)
     if by_rivals and not doubtful:
         _suspect_receiver(state, source, values, params)
@@ -176,7 +174,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if trusted and heard and not doubtful:
         rivals.watch_inertial(state, seen, weight, spread, fits)
     if state.stamps[ALIVE] > 0:
-        rivals.decide(state, params)
+        rivals.decide(state, rests(state, params) and _moves(state, params), params)
     if not fused and int(parameter[RESETS]) == HEIGHT_OFFSET_ERROR.start and memory[BIASED] > source_health.DISTRUST:
         _reset_offset(state, seen)  # a barometer that is off by a constant has another offset now: weather, a window
         source_health.begin(memory)
@@ -201,6 +199,13 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
 
 
 @compiled
+def _moves(state: FilterState, params: Parameters) -> bool:
+    """Whether the suspected receiver says that the vehicle moves."""
+    velocity = int(params.model_parameters[int(state.stamps[SUSPECT]), COMPANION])
+    return velocity >= 0 and state.memory[velocity, LOWEST_SPEED] > 0.0
+
+
+@compiled
 def _judge(
     state: FilterState,
     source: int,
@@ -214,7 +219,7 @@ def _judge(
     """Judge a source by its whitened innovation (m,). While rivals contend the others are not: nobody knows who is right.
     A receiver that was found to lie comes back when its readings are as good as the main state expects."""
     memory, stamps, model = state.memory[source], state.source_stamps[source], params.models[source]
-    gnss = model == GNSS_POSITION or model == GNSS_VELOCITY
+    gnss = model in (GNSS_POSITION, GNSS_VELOCITY)
     if memory[EXCLUDED] != 0:
         distance = 0.0
         for a in range(m):

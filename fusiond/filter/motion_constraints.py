@@ -9,7 +9,7 @@ from fusiond.filter.measurement_update import project, update_projected
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
 from fusiond.filter.observations.model import Observation, with_rate_noise
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import is_trusted
+from fusiond.filter.source_health import is_stuck
 from fusiond.filter.state import (
     ALIVE,
     CONSTRAINT_FUSED,
@@ -81,7 +81,7 @@ def carried(state: FilterState, wheel_speed: float, params: Parameters) -> bool:
         return False
     for i in params.velocities:
         fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= GNSS_FRESH_NS
-        if fresh and state.memory[i, LOWEST_SPEED] > CARRIED_SPEED and is_trusted(state.memory[i]):
+        if fresh and state.memory[i, LOWEST_SPEED] > CARRIED_SPEED and not is_stuck(state.memory[i]):
             return True
     return False
 
@@ -180,7 +180,8 @@ def _apply(state: FilterState, which: int, params: Parameters, factor: float) ->
     ratio, fused = update_projected(state, seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
     if state.stamps[ALIVE] > 0:
         _apply_to_rivals(state, which, params, factor, fits)
-    rivals.watch_inertial(state, seen, factor, spread, fits)
+    if which == NON_HOLONOMIC:  # that it stands is inferred itself: it may turn on a plate, or be carried
+        rivals.watch_inertial(state, seen, factor, spread, fits)
     state.auxiliary[CONSTRAINT_RATIO.start + which] = ratio
     if fused:
         state.stamps[CONSTRAINT_FUSED.start + which] += 1
@@ -203,4 +204,4 @@ def _apply_to_rivals(state: FilterState, which: int, params: Parameters, factor:
                 own = rivals.likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
                 rivals.weigh(state, slot, own, fits)
                 update_projected(rival, seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
-    rivals.decide(state, params)
+    rivals.decide(state, rests(state, params), params)

@@ -260,7 +260,7 @@ def uses(state: FilterState, slot: int, source: int, params: Parameters) -> bool
     if suspect >= 0 and (source == suspect or source == int(params.model_parameters[suspect, COMPANION])):
         if slot == RECEIVER:
             return False
-        if slot == RETURN or slot == INERTIAL:
+        if slot in (RETURN, INERTIAL):
             return True
     return state.memory[source, EXCLUDED] == 0
 
@@ -330,8 +330,9 @@ def wrong(state: FilterState, carried: bool) -> float:
 
 
 @compiled
-def decide(state: FilterState, params: Parameters) -> None:
-    """Give up rivals that have become unlikely, and let one lead where the expected loss is less so."""
+def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
+    """Give up rivals that have become unlikely, and let one lead where the expected loss is less so. While the wheels rest
+    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried."""
     total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
@@ -362,7 +363,7 @@ def decide(state: FilterState, params: Parameters) -> None:
                 needed = LEAD_BY_LOSS * params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
             elif slot == RETURN:
                 needed *= params.spoof_cost / params.dead_reckoning_cost
-            if odds >= needed * against:
+            if odds >= needed * against and not (disputed and slot == RECEIVER):
                 _lead(state, slot, params)
                 return
 
@@ -440,5 +441,7 @@ def probability_of_lie(state: FilterState, source: int, params: Parameters) -> f
     if source == params.imu_source:
         return float(state.nominal[INERTIAL_DOUBT])
     if params.models[source] in (GNSS_POSITION, GNSS_VELOCITY):
-        return float(state.memory[source, EXCLUDED])
+        named = state.stamps[ALIVE] > 0 and position_of(source, params) == state.stamps[SUSPECT]
+        sure = bool(named and state.bank[RECEIVER, 0] >= LEAD / (1 + LEAD))  # though the main state, by its gate, is as good
+        return float(state.memory[source, EXCLUDED] != 0 or sure)
     return None

@@ -1273,7 +1273,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
         stamps[1] = (<int64_t>-4611686018427387904)
         source_health_begin(memory)
-    by_rivals = ((model == 0) or (model == 1))
+    by_rivals = (model == 0 or model == 1)
     doubtful = motion_constraints_disputed(state, (source if (model == 1) else (<int64_t>(parameter[11]))), params)
     before = source_health_odds_of_bias(memory)
     if (not doubtful):
@@ -1326,7 +1326,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     if (trusted and heard and (not doubtful)):
         rivals_watch_inertial(state, &seen, weight, spread, fits)
     if (state.stamps[22] > 0):
-        rivals_decide(state, params)
+        rivals_decide(state, (motion_constraints_rests(state, params) and measurement__moves(state, params)), params)
     if ((not fused) and ((<int64_t>(parameter[13])) == 29) and (memory[6] > 0.5)):
         measurement__reset_offset(state, &seen)
         source_health_begin(memory)
@@ -1349,6 +1349,11 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         source_health_note_rejected(memory, values[0], seen.innovation[0])
     return fused
 
+cdef bint measurement__moves(State* state, Parameters* params) noexcept nogil:
+    cdef int64_t velocity
+    velocity = (<int64_t>(params.model_parameters[((<int64_t>(state.stamps[23]))) * PARAMETERS + 11]))
+    return ((velocity >= 0) and (state.memory[(velocity) * MEMORY_SIZE + 1] > 0.0))
+
 cdef void measurement__judge(State* state, int64_t source, double* whitened, int64_t m, bint same, int64_t t_ns, double correlation, Parameters* params) noexcept nogil:
     cdef double* memory
     cdef int64_t* stamps
@@ -1360,7 +1365,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
     model = params.models[source]
-    gnss = ((model == 0) or (model == 1))
+    gnss = (model == 0 or model == 1)
     if (memory[18] != 0):
         distance = 0.0
         for a in range(m):
@@ -1871,7 +1876,7 @@ cdef bint motion_constraints_carried(State* state, double wheel_speed, Parameter
     for _k1 in range(params.velocities_count):
         i = params.velocities[_k1]
         fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 2000000000)
-        if (fresh and (state.memory[(i) * MEMORY_SIZE + 1] > 1.0) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+        if (fresh and (state.memory[(i) * MEMORY_SIZE + 1] > 1.0) and (not source_health_is_stuck(state.memory + (i) * MEMORY_SIZE))):
             return True
     return False
 
@@ -1976,7 +1981,8 @@ cdef bint motion_constraints__apply(State* state, int64_t which, Parameters* par
     fused = _t1[1]
     if (state.stamps[22] > 0):
         motion_constraints__apply_to_rivals(state, which, params, factor, fits)
-    rivals_watch_inertial(state, &seen, factor, spread, fits)
+    if (which == 0):
+        rivals_watch_inertial(state, &seen, factor, spread, fits)
     state.auxiliary[(33 + which)] = ratio
     if fused:
         state.stamps[(12 + which)] += 1
@@ -2000,7 +2006,7 @@ cdef void motion_constraints__apply_to_rivals(State* state, int64_t which, Param
                 own = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
                 rivals_weigh(state, slot, own, fits)
                 measurement_update_update_projected(&rival, &seen, params.gates[seen.m], factor, True, 0.0, across, spread, True)
-    rivals_decide(state, params)
+    rivals_decide(state, motion_constraints_rests(state, params), params)
 
 # ---------------- fusiond.filter.north_east_down
 
@@ -2745,7 +2751,7 @@ cdef bint rivals_uses(State* state, int64_t slot, int64_t source, Parameters* pa
     if ((suspect >= 0) and ((source == suspect) or (source == (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))))):
         if (slot == 1):
             return False
-        if ((slot == 2) or (slot == 0)):
+        if (slot == 2 or slot == 0):
             return True
     return (state.memory[(source) * MEMORY_SIZE + 18] == 0)
 
@@ -2801,7 +2807,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     _t1 = (state.auxiliary[42] + (0.0001 * (0.0 if 0.0 > since else since)))
     return (0.9 if 0.9 < _t1 else _t1)
 
-cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
+cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
     cdef double total
     cdef int64_t slot
     cdef State hypothesis
@@ -2849,7 +2855,7 @@ cdef void rivals_decide(State* state, Parameters* params) noexcept nogil:
                 needed = (((10.0 * params.dead_reckoning_cost) / params.spoof_cost) * sqrt((blurred / apart)))
             elif (slot == 2):
                 needed *= (params.spoof_cost / params.dead_reckoning_cost)
-            if (odds >= (needed * against)):
+            if ((odds >= (needed * against)) and (not (disputed and (slot == 1)))):
                 rivals__lead(state, slot, params)
                 return
 
