@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-import numpy as np
-
+from fusiond.filter.measurement_update import cholesky, inject
 from fusiond.filter.observations.gnss_position import (
     ERROR_TIME,
     SLOW_SHARE,
@@ -24,7 +23,6 @@ from fusiond.filter.observations.gnss_position import (
     VARIANCE_HORIZONTAL,
     VARIANCE_VERTICAL,
 )
-from fusiond.filter.measurement_update import cholesky, inject
 from fusiond.filter.observations.model import NOISE_MAX, NOISE_MIN, Observation
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import noise_factor

@@ -29,8 +29,8 @@ from fusiond.filter.state import (
     BIASED,
     EXCLUDED,
     HEIGHT_OFFSET,
-    INERTIAL_DOUBT,
     HEIGHT_OFFSET_ERROR,
+    INERTIAL_DOUBT,
     LAST_RATIO,
     LAST_SPEED,
     LOWEST_SPEED,
@@ -95,7 +95,7 @@ def _carry_error(state: FilterState, source: int, values: Vector, params: Parame
 
 
 @compiled
-def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0915 - one way of one measurement, top to bottom
+def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool:  # noqa: PLR0912, PLR0915 - one way of one measurement, top to bottom
     """Judge and fuse one measurement, a row of the table, at the state's own instant. Returns whether it was fused."""
     source, t_ns = int(row["source"]), int(row["t_ns"])
     model, values = params.models[source], row["values"]
@@ -323,8 +323,8 @@ def _suspect_receiver(state: FilterState, source: int, values: Vector, params: P
 
 @compiled
 def _suspect_state(state: FilterState, source: int, values: Vector, seen: Observation, params: Parameters) -> None:
-    """Where a receiver that is called a liar may be right all the same, as likely as the state is wrong, begin the rival that
-    is where it says."""
+    """Where a receiver that is called a liar may be right all the same, as likely as the state is wrong, begin the rival
+    that is where it says."""
     odds = state.bank[rivals.RECEIVER, 0]
     if not odds > 0 or state.bank[rivals.RETURN, 0] > 0 or state.stamps[SUSPECT] != source:
         return

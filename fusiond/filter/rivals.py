@@ -58,7 +58,7 @@ BEGIN = 0.01  # odds with which a rival begins
 END = 1e-7  # and below which it is given up
 GOOD_NIS = 1.5  # mean squared innovation per axis, in sigmas, of a receiver that does not lie
 LEAD = 100.0  # odds against all others with which a rival leads, where no loss says otherwise
-LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, at equal losses
+LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, or goes where that is, at equal losses
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
 MIN_WEIGHT = 1e-100
@@ -73,7 +73,7 @@ FIRST = 0.1  # of these variances, that a lie has for certain
 LARGER = 0.3  # chance that a lie is larger than that
 GOES_ON = 10.0  # of these variances, that a large one has from then on
 LARGEST = 100.0  # and at most by this factor, in variance
-WRONG_RATE = 1e-4  # 1/s: how often dead reckoning goes wrong unnoticed
+WRONG_TIME = 200.0  # s of dead reckoning after which it is likelier than not that it has gone wrong unnoticed
 MAX_WRONG = 0.9
 WRONG_AFTER_LIE = 0.5  # probability that the position is wrong after the inertial sensor lied
 
@@ -169,7 +169,9 @@ def with_lie(seen: Observation, spread: Matrix3, scale: float, widened: Matrix3)
 
 
 @compiled
-def fit_lie(rival: FilterState, seen: Observation, across: ErrorRows3, spread: Matrix3) -> float:
+def fit_lie(  # noqa: PLR0912 - loops
+    rival: FilterState, seen: Observation, across: ErrorRows3, spread: Matrix3
+) -> float:
     """Let the rival in which the inertial sensor lied take the lie that explains an observation best, delta = Lambda H'
     (S + H Lambda H')^-1 d, as an uncertainty of that size, if that makes it likelier and the lie is fresh. `across` and
     `spread`, H P and H P H', become those of P + delta delta'. Returns how likely
@@ -326,7 +328,7 @@ def wrong(state: FilterState, carried: bool) -> float:
     if carried:
         return MAX_WRONG
     since = (state.stamps[T] - state.stamps[T_POSITION]) * 1e-9
-    return min(state.auxiliary[STATE_DOUBT] + WRONG_RATE * max(since, 0.0), MAX_WRONG)
+    return min(state.auxiliary[STATE_DOUBT] + square(since / WRONG_TIME), MAX_WRONG)
 
 
 @compiled
@@ -362,7 +364,7 @@ def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
                     blurred += rival.covariance[POSITION.start + i, POSITION.start + i]
                 needed = LEAD_BY_LOSS * params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
             elif slot == RETURN:
-                needed *= params.spoof_cost / params.dead_reckoning_cost
+                needed = LEAD_BY_LOSS * params.spoof_cost / params.dead_reckoning_cost
             if odds >= needed * against and not (disputed and slot == RECEIVER):
                 _lead(state, slot, params)
                 return
@@ -437,7 +439,7 @@ def mix(state: FilterState) -> None:
 
 
 def probability_of_lie(state: FilterState, source: int, params: Parameters) -> float | None:
-    """That a source lies, as far as rivals have decided on that: of a receiver, and of the inertial sensor. None of another."""
+    """That a source lies, as far as rivals have decided: of a receiver, and of the inertial sensor. None of another."""
     if source == params.imu_source:
         return float(state.nominal[INERTIAL_DOUBT])
     if params.models[source] in (GNSS_POSITION, GNSS_VELOCITY):

@@ -80,6 +80,8 @@ class Belief(NamedTuple):
 
 
 INERTIAL_AXES = ("accelerometer x", "accelerometer y", "accelerometer z", "gyro x", "gyro y", "gyro z")  # by FROZEN_PLACE
+LIAR = "it contradicts the wheels and the inertial sensor; not fused"
+CONTRADICTED = "it contradicts all the others; what it said lately counts for less"
 STATUSES = ("nominal", "noisy", "biased", "frozen", "absent")
 
 
@@ -347,10 +349,12 @@ def belief(memory: Array, stamps: Stamps, t_ns: int, since_ns: int, lies: float 
     nominal, noisy, biased, frozen = (float(p) * (1 - absent) for p in kept)
     probabilities = (nominal, noisy, biased, frozen, absent)
     status = STATUSES[max(range(len(STATUSES)), key=probabilities.__getitem__)]
+    if status == "biased" and lies is not None:
+        return Belief(probabilities, status, LIAR if memory[EXCLUDED] else CONTRADICTED)
     return Belief(probabilities, status, _reason(memory, status, age))
 
 
-def _reason(memory: Array, status: str, age: float) -> str:
+def _reason(memory: Array, status: str, age: float) -> str:  # noqa: PLR0911 - one for each status
     """What speaks for a status, for people."""
     match status:
         case "noisy":

@@ -2804,7 +2804,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[42] + (0.0001 * (0.0 if 0.0 > since else since)))
+    _t1 = (state.auxiliary[42] + portable_square((since / 200.0)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
@@ -2854,7 +2854,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
                     blurred += rival.covariance[((0 + i)) * n + (0 + i)]
                 needed = (((10.0 * params.dead_reckoning_cost) / params.spoof_cost) * sqrt((blurred / apart)))
             elif (slot == 2):
-                needed *= (params.spoof_cost / params.dead_reckoning_cost)
+                needed = ((10.0 * params.spoof_cost) / params.dead_reckoning_cost)
             if ((odds >= (needed * against)) and (not (disputed and (slot == 1)))):
                 rivals__lead(state, slot, params)
                 return
