@@ -49,6 +49,12 @@ def ramp(t: Array, begin: float, length: float) -> Array:
     return u * u * (3 - 2 * u)
 
 
+def ramped(t: Array, begin: float, length: float) -> Array:
+    """The integral of `ramp`."""
+    u = np.clip((t - begin) / length, 0.0, 1.0)
+    return length * u**3 * (1 - u / 2) + np.maximum(t - begin - length, 0.0)
+
+
 def config(wheels: Iterable[str] = WHEELS, **tables: dict[str, Any]) -> Config:
     """A configuration of one IMU, one GNSS receiver of white errors and some wheels; `tables` holds keys of filter, motion,
     imu, gnss and of all wheels (wheel)."""
@@ -113,13 +119,19 @@ def drive(
 
 
 def town(duration: float, rate: float = 100.0, start: tuple[float, float, float] = MUNICH) -> Drive:
-    """Pulls away after 3 s, weaves, and changes its speed all the time; stands again from second 35 to 40."""
+    """Pulls away after 3 s, weaves, and changes its speed all the time; stands again from second 35 to 40, without a turn."""
+
+    def going(t: Array) -> Array:
+        return ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
 
     def speed(t: Array) -> Array:
-        going = ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
-        return going * (12.0 + 2.0 * np.sin(0.4 * t))
+        return going(t) * (12.0 + 2.0 * np.sin(0.4 * t))
 
-    return drive(duration, speed, lambda t: 0.7 + 0.8 * np.sin(0.15 * t) * ramp(t, 3.0, 6.0), rate, start)
+    def yaw(t: Array) -> Array:
+        at = t - ramped(t, 30.0, 5.0) + ramped(t, 40.0, 4.0)  # a clock that rests with the vehicle
+        return 0.7 + 0.8 * np.sin(0.15 * at) * ramp(t, 3.0, 6.0)
+
+    return drive(duration, speed, yaw, rate, start)
 
 
 def measurements(
