@@ -119,7 +119,7 @@ def drive(
 
 
 def town(duration: float, rate: float = 100.0, start: tuple[float, float, float] = MUNICH) -> Drive:
-    """Pulls away after 3 s, weaves, and changes its speed all the time; stands again from second 35 to 40, without a turn."""
+    """Pulls away after 3 s, weaves, and changes its speed all the time; stands again from second 35 to 40, not turning."""
 
     def going(t: Array) -> Array:
         return ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
