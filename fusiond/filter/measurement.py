@@ -163,7 +163,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         main = fits if trusted else unread
         chance = rivals.SHARE_OF_LIAR * unread / main if main > 0 else 1.0
         lie = gained if by_rivals else rivals.SHARE_OF_LIAR
-        best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params)
+        shared = 0.0 if ratio <= 1 else gained
+        best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, shared, params)
         lie = max(lie, returned)
         if not ratio <= 1:
             lie = max(lie, max(chance, best))

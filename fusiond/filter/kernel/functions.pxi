@@ -1232,6 +1232,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double main
     cdef double chance
     cdef double lie
+    cdef double shared
     cdef (double, double) _t4
     cdef double best
     cdef double returned
@@ -1309,7 +1310,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         main = (fits if trusted else unread)
         chance = (((0.1 * unread) / main) if (main > 0) else 1.0)
         lie = (gained if by_rivals else 0.1)
-        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
+        shared = (0.0 if (ratio <= 1) else gained)
+        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, shared, params)
         best = _t4[0]
         returned = _t4[1]
         lie = (returned if returned > lie else lie)
