@@ -49,6 +49,12 @@ def ramp(t: Array, begin: float, length: float) -> Array:
     return u * u * (3 - 2 * u)
 
 
+def ramped(t: Array, begin: float, length: float) -> Array:
+    """The integral of a ramp over the time."""
+    u = np.clip((t - begin) / length, 0.0, 1.0)
+    return length * (u**3 - u**4 / 2) + np.clip(t - begin - length, 0.0, None)
+
+
 def config(wheels: Iterable[str] = WHEELS, **tables: dict[str, Any]) -> Config:
     """A configuration of one IMU, one GNSS receiver of white errors and some wheels; `tables` holds keys of filter, motion,
     imu, gnss and of all wheels (wheel)."""
@@ -119,7 +125,11 @@ def town(duration: float, rate: float = 100.0, start: tuple[float, float, float]
         going = ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
         return going * (12.0 + 2.0 * np.sin(0.4 * t))
 
-    return drive(duration, speed, lambda t: 0.7 + 0.8 * np.sin(0.15 * t) * ramp(t, 3.0, 6.0), rate, start)
+    def yaw(t: Array) -> Array:
+        under_way = t - ramped(t, 33.0, 2.0) + ramped(t, 40.0, 2.0)  # it does not turn where it stands
+        return 0.7 + 0.8 * np.sin(0.15 * under_way) * ramp(t, 3.0, 6.0)
+
+    return drive(duration, speed, yaw, rate, start)
 
 
 def measurements(
