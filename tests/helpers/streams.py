@@ -23,6 +23,7 @@ from fusiond.filter.state import (
     RESET_SOURCE,
     RESETS,
     RUNNING,
+    T_POSITION,
     VELOCITY_E,
     FilterState,
     ResetReason,
@@ -205,7 +206,8 @@ def running_state(
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)
     state.auxiliary[[2, 8]] -= 9.8
-    state.stamps[PHASE], state.stamps[T] = RUNNING, T0
+    state.stamps[PHASE] = RUNNING
+    state.stamps[T] = state.stamps[T_POSITION] = T0
     return state
 
 
