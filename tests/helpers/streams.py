@@ -23,6 +23,7 @@ from fusiond.filter.state import (
     RESET_SOURCE,
     RESETS,
     RUNNING,
+    T_POSITION,
     VELOCITY_E,
     FilterState,
     ResetReason,
@@ -50,9 +51,9 @@ def ramp(t: Array, begin: float, length: float) -> Array:
 
 
 def ramped(t: Array, begin: float, length: float) -> Array:
-    """The integral of `ramp`."""
+    """The integral of a ramp over the time."""
     u = np.clip((t - begin) / length, 0.0, 1.0)
-    return length * u**3 * (1 - u / 2) + np.maximum(t - begin - length, 0.0)
+    return length * (u**3 - u**4 / 2) + np.clip(t - begin - length, 0.0, None)
 
 
 def config(wheels: Iterable[str] = WHEELS, **tables: dict[str, Any]) -> Config:
@@ -119,17 +120,15 @@ def drive(
 
 
 def town(duration: float, rate: float = 100.0, start: tuple[float, float, float] = MUNICH) -> Drive:
-    """Pulls away after 3 s, weaves, and changes its speed all the time; stands again from second 35 to 40, not turning."""
-
-    def going(t: Array) -> Array:
-        return ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
+    """Pulls away after 3 s, weaves, and changes its speed all the time; stands again from second 35 to 40."""
 
     def speed(t: Array) -> Array:
-        return going(t) * (12.0 + 2.0 * np.sin(0.4 * t))
+        going = ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
+        return going * (12.0 + 2.0 * np.sin(0.4 * t))
 
     def yaw(t: Array) -> Array:
-        at = t - ramped(t, 30.0, 5.0) + ramped(t, 40.0, 4.0)  # a clock that rests with the vehicle
-        return 0.7 + 0.8 * np.sin(0.15 * at) * ramp(t, 3.0, 6.0)
+        under_way = t - ramped(t, 33.0, 2.0) + ramped(t, 40.0, 2.0)  # it does not turn where it stands
+        return 0.7 + 0.8 * np.sin(0.15 * under_way) * ramp(t, 3.0, 6.0)
 
     return drive(duration, speed, yaw, rate, start)
 
@@ -207,7 +206,8 @@ def running_state(
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)
     state.auxiliary[[2, 8]] -= 9.8
-    state.stamps[PHASE], state.stamps[T] = RUNNING, T0
+    state.stamps[PHASE] = RUNNING
+    state.stamps[T] = state.stamps[T_POSITION] = T0
     return state
 
 

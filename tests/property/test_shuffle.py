@@ -60,7 +60,6 @@ def configuration(case: Case) -> Config:
             "horizon_s": case["horizon_s"],
             "snapshot_interval_s": case["snapshot_interval_s"],
             "imu_gap_s": 0.1,
-            "gnss_reset_s": 0.7,
         },
         gnss=(gnss if learns else {})
         | {"position_correlation_s": case["correlation_s"], "velocity_correlation_s": case["correlation_s"]},

@@ -126,8 +126,8 @@ def test_riccati_steady_state() -> None:
 
 def ill_conditioned(rng: np.random.Generator) -> Array:
     """A covariance of condition 1e12 with eigenvectors in all directions."""
-    turn, _ = np.linalg.qr(rng.normal(size=(18, 18)))
-    covariance: Array = turn @ np.diag(np.logspace(6, -6, 18)) @ turn.T
+    turn, _ = np.linalg.qr(rng.normal(size=(ERROR_SIZE, ERROR_SIZE)))
+    covariance: Array = turn @ np.diag(np.logspace(6, -6, ERROR_SIZE)) @ turn.T
     covariance[ATTITUDE] *= 1e-3  # of angles that there are
     covariance[:, ATTITUDE] *= 1e-3
     return (covariance + covariance.T) / 2
@@ -140,7 +140,7 @@ def test_joseph_form_keeps_an_ill_conditioned_covariance_positive(compiled: bool
     state = running_state(np.random.default_rng(seed))
     p = ill_conditioned(np.random.default_rng(seed))
     state.covariance[:] = p
-    sigma, h = 1e-6, np.eye(18)[POSITION]
+    sigma, h = 1e-6, np.eye(ERROR_SIZE)[POSITION]
     short = p - p @ h.T @ np.linalg.inv(h @ p @ h.T + sigma**2 * np.eye(3)) @ h @ p
     assert np.abs(short[POSITION, POSITION] - sigma**2 * np.eye(3)).max() > sigma**2
     settings = config(gnss={"position_sigma_m": sigma, "height_sigma_m": sigma})
@@ -253,8 +253,8 @@ def test_projection_and_whitening_against_matrices(m: int) -> None:
 def test_a_correction_turns_along_with_the_attitude() -> None:
     """P = M P M', with -[correction]x where M's rows of position and velocity meet its columns of attitude."""
     rng = np.random.default_rng(6)
-    state, error = running_state(rng), rng.normal(size=18)
-    turn = np.eye(18)
+    state, error = running_state(rng), rng.normal(size=ERROR_SIZE)
+    turn = np.eye(ERROR_SIZE)
     for block in (POSITION, VELOCITY):
         turn[block, ATTITUDE] = -skew(error[block])
     expected = turn @ state.covariance @ turn.T

@@ -149,8 +149,8 @@ def test_a_simulated_drive(tmp_path: Path) -> None:
 
 
 def test_an_offset_that_jumps_is_learnt_anew() -> None:
-    """By a window that is opened at speed, say: rejected, and after `gnss_reset_s` believed, without a jump of the state."""
-    chosen = settings(filter={"gnss_reset_s": 5.0})
+    """By a window that is opened at speed, say: rejected, and believed once it is called biased, without a jump of the state."""
+    chosen = settings()
     events = measurements(DRIVE, ("rear_left", "rear_right"))
     fusion = fuse(chosen, ordered(events + readings(last=15.0) + readings(OFFSET + 60.0, 15.0, seed=6)))
     offset, sigma = offset_of(fusion)
