@@ -29,6 +29,7 @@ from fusiond.filter.state import (
     BIASED,
     EXCLUDED,
     HEIGHT_OFFSET,
+    INERTIAL_DOUBT,
     HEIGHT_OFFSET_ERROR,
     LAST_RATIO,
     LAST_SPEED,
@@ -122,6 +123,10 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         row["variance"][a] = spread[a, a] + learnt[a]
     if model == GNSS_POSITION:
         m = seen.m = HORIZONTAL
+    elif state.nominal[INERTIAL_DOUBT] > rivals.FRESH and source_health.is_used(memory, True):
+        for a in range(m):
+            seen.variance[a] = learnt[a]
+        rivals.fit_lie(state, seen, across, spread)
     weight = factor_of(stamps, model, values, parameter, t_ns)
     if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
         stamps[T_FUSED] = NEVER
@@ -158,7 +163,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
         main = fits if trusted else unread
         chance = rivals.SHARE_OF_LIAR * unread / main if main > 0 else 1.0
         lie = gained if by_rivals else rivals.SHARE_OF_LIAR
-        best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, gained, params)
+        shared = 0.0 if ratio <= 1 else gained
+        best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, shared, params)
         lie = max(lie, returned)
         if not ratio <= 1:
             lie = max(lie, max(chance, best))
@@ -219,7 +225,8 @@ def _judge(
         return
     if not gnss and state.stamps[ALIVE] > 0:
         return
-    if model == WHEEL_SPEED and not carried(state, memory[LAST_SPEED], params) and rivals.wheels_contradict(state, params):
+    trusted = source_health.is_trusted(memory) and not carried(state, memory[LAST_SPEED], params)
+    if model == WHEEL_SPEED and trusted and rivals.wheels_contradict(state, params):
         rivals.suspect_motion(state, rivals.BEGIN)
         return
     if source_health.is_due(stamps, t_ns, correlation):

@@ -20,7 +20,7 @@ from fusiond.filter.measurement_update import cholesky, difference, inject, proj
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS, begin, distrust, odds_of_bias
+from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS, begin, distrust, is_trusted, odds_of_bias
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ALIVE,
@@ -213,7 +213,7 @@ def wheels_contradict(state: FilterState, params: Parameters) -> bool:
     """Whether most of the wheels that were heard lately contradict the main state: then it is not one of them that lies."""
     heard = against = 0
     for i in params.wheels:
-        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS:
+        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[i]):
             heard += 1
             if state.memory[i, LAST_RATIO] > 1:
                 against += 1

@@ -1232,6 +1232,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double main
     cdef double chance
     cdef double lie
+    cdef double shared
     cdef (double, double) _t4
     cdef double best
     cdef double returned
@@ -1264,6 +1265,10 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         _t1 = 2
         m = _t1
         seen.m = _t1
+    elif ((state.nominal[31] > 0.05) and source_health_is_used(memory, True)):
+        for a in range(m):
+            seen.variance[a] = learnt[a]
+        rivals_fit_lie(state, &seen, across, spread)
     weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
     if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
         stamps[1] = (<int64_t>-4611686018427387904)
@@ -1305,7 +1310,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         main = (fits if trusted else unread)
         chance = (((0.1 * unread) / main) if (main > 0) else 1.0)
         lie = (gained if by_rivals else 0.1)
-        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, gained, params)
+        shared = (0.0 if (ratio <= 1) else gained)
+        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, shared, params)
         best = _t4[0]
         returned = _t4[1]
         lie = (returned if returned > lie else lie)
@@ -1350,6 +1356,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     cdef bint gnss
     cdef double distance
     cdef int64_t a
+    cdef bint trusted
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
     model = params.models[source]
@@ -1364,7 +1371,8 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
         return
     if ((not gnss) and (state.stamps[22] > 0)):
         return
-    if ((model == 2) and (not motion_constraints_carried(state, memory[0], params)) and rivals_wheels_contradict(state, params)):
+    trusted = (source_health_is_trusted(memory) and (not motion_constraints_carried(state, memory[0], params)))
+    if ((model == 2) and trusted and rivals_wheels_contradict(state, params)):
         rivals_suspect_motion(state, 0.01)
         return
     if source_health_is_due(stamps, t_ns, correlation):
@@ -2689,7 +2697,7 @@ cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept no
     against = _t1
     for _k2 in range(params.wheels_count):
         i = params.wheels[_k2]
-        if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
+        if (((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
             heard += 1
             if (state.memory[(i) * MEMORY_SIZE + 2] > 1):
                 against += 1
