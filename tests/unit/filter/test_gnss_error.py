@@ -184,14 +184,15 @@ def test_the_first_position_is_off_by_what_the_first_fix_is(compiled: bool) -> N
 @pytest.mark.parametrize("tau", [5.0, 40.0])
 def test_a_mean_of_fixes_is_worth_what_it_is(tau: float) -> None:
     """At rest, the variance of the best mean of fixes over a span T with errors correlated over tau: 2 tau / (2 tau + T) of
-    the slow variance, for a position that does not move (Grenander and Szego; white noise adds a little)."""
+    the slow variance, for a position that does not move (Grenander and Szego; white noise adds a little, and
+    what a standstill leaves of the velocity)."""
     stands = drive(60.0, lambda t: 0.0 * t, lambda t: 0.3 + 0.0 * t)
     settings = config(gnss=GNSS | {"position_correlation_s": tau}, filter={"heading_deg": 17.0})
     head = fuse(settings, measurements(stands, seed=None)).history.head
     to_n = mat_ne(head.nominal[POSITION_E])
     north = float(to_n[0] @ head.covariance[POSITION, POSITION] @ to_n[0])
     span = (int(head.stamps[T]) - T0) / SECOND - 1.0
-    assert north == pytest.approx(SLOW * 4.0 * 2 * tau / (2 * tau + span), rel=0.1)
+    assert north == pytest.approx(SLOW * 4.0 * 2 * tau / (2 * tau + span), rel=0.12)
 
 
 def of_type(fix_type: int) -> Array:

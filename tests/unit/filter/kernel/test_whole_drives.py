@@ -288,10 +288,9 @@ def test_an_inertial_sensor_that_lies(wide: bool) -> None:
 def test_a_barometer_that_jumps() -> None:
     """The height offset is put where its source says, after that was rejected for long."""
     events = sensed(town(20.0, rate=25.0), wheels=())
-    events += [
-        Measurement(T0 + 7 * MS + k * 200 * MS, "baro", k, T0, Pressure((95_000.0 if k < 40 else 94_000.0) + 3.0 * math.sin(k), 290.0))
-        for k in range(100)
-    ]
+    for k in range(100):
+        pressure = (95_000.0 if k < 40 else 94_000.0) + 3.0 * math.sin(k)
+        events.append(Measurement(T0 + 7 * MS + k * 200 * MS, "baro", k, T0, Pressure(pressure, 290.0)))
     settings = config((), filter=HEADED, barometer={"baro": {"link": "link", "sigma_m": 0.5}})
     fusion = both_kernels(settings, sorted(events, key=lambda event: event.key))
     assert fusion.outcomes()["baro"]["FUSED"] > 45
