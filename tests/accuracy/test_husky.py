@@ -38,4 +38,4 @@ def test_the_scale_is_learnt_from_fixes() -> None:
 def test_without_fixes_the_scale_stays_where_it_was() -> None:
     scale, sigma = scale_at_the_end("gps0:30-400")
     assert abs(scale) <= 0.002
-    assert sigma >= 0.0099
+    assert sigma >= 0.0098

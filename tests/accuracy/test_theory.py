@@ -1,4 +1,5 @@
-"""Consistency by Monte Carlo: the errors of many runs against the covariance that the filter claims."""
+"""Consistency by Monte Carlo: the errors of many runs against the covariance that the filter claims. Rival hypotheses: their
+weights, their mixture and the decision between them against the closed forms."""
 
 from __future__ import annotations
 
@@ -8,19 +9,30 @@ import numpy as np
 import pytest
 
 from fusiond.estimator.fusion import Fusion
+from fusiond.filter import rivals
+from fusiond.filter.measurement_update import difference, inject
+from fusiond.filter.parameters import Parameters, make_parameters
 from fusiond.filter.state import (
     ACCEL_BIAS_B,
     ATTITUDE,
+    EXCLUDED,
     GYRO_BIAS_B,
+    MAIN_WEIGHT,
     POSITION,
     POSITION_E,
     QUATERNION_EB,
+    RESET_REASON,
+    SUSPECT,
     VELOCITY,
     VELOCITY_E,
+    FilterState,
+    ResetReason,
 )
 from fusiond.maths.rotation import matrix
 from tests.conftest import needs_compiled
-from tests.helpers.streams import SECOND, T0, Drive, config, measurements, town
+from tests.helpers.streams import SECOND, T0, Drive, config, measurements, running_state, town
+from tests.oracles.decision import posterior
+from tests.oracles.mixture import Mixture, collapse
 
 RUNS, SECONDS = 10, 60.0
 BLOCKS = {"position": POSITION, "velocity": VELOCITY, "attitude": ATTITUDE}
@@ -83,3 +95,80 @@ def test_innovations_are_as_large_as_claimed(study: dict[str, np.ndarray]) -> No
     """NIS of the positions, horizontal: their noise is white, so its mean over all runs lies close to 2."""
     nis = study["gnss"]
     assert nis.mean() == pytest.approx(2.0, abs=0.2)
+
+
+def contested(odds: dict[int, float], **costs: float) -> tuple[FilterState, Parameters, int]:
+    """A state with rivals of these odds against it, the configuration's parameters, and the suspected receiver."""
+    params, state = make_parameters(config(filter=costs)), running_state(np.random.default_rng(4))
+    receiver = params.sources.index("gps0.position")
+    state.stamps[SUSPECT] = receiver
+    for slot, value in odds.items():
+        rivals.open_slot(state, slot, value)
+    return state, params, receiver
+
+
+def test_rivals_are_weighed_by_bayes_rule() -> None:
+    """D4: three rivals and three readings; the weights sum to 1, and a rival that has become unlikely is given up."""
+    prior = {rivals.INERTIAL: 0.2, rivals.RECEIVER: 0.3, rivals.RETURN: 0.1}
+    state, params, _ = contested(prior)
+    likelihoods = np.array([[1.0, 0.5, 2.0, 0.3], [0.2, 0.9, 0.4, 0.1], [0.7, 0.1, 0.3, 0.002]])
+    held = np.array([1.0, *prior.values()])
+    for main, *others in likelihoods:
+        for slot, own in zip(prior, others, strict=True):
+            rivals.weigh(state, slot, own, main)
+        rivals.decide(state, params)
+    held = posterior(held, likelihoods)
+    assert held[3] < rivals.BEGIN / 10
+    found = [state.auxiliary[MAIN_WEIGHT], *state.bank[list(prior), 0]]
+    np.testing.assert_allclose(found, [*held[:3], 0.0], rtol=1e-12)
+    rivals.decide(state, params)
+    assert state.auxiliary[MAIN_WEIGHT] + state.bank[:, 0].sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_what_is_published_has_the_moments_of_the_rivals() -> None:
+    """B6 and A7: the mean, of least squared loss, and the covariance of the mixture of the main state and three rivals."""
+    odds = {rivals.INERTIAL: 0.5, rivals.RECEIVER: 0.3, rivals.WHEELS: 0.2}
+    state, _, _ = contested(odds)
+    state.covariance *= 1e-6
+    errors, spreads = [np.zeros(state.size)], [state.covariance.copy()]
+    for number, slot in enumerate(odds):
+        rival, error = state.hypothesis(slot), np.random.default_rng(number).normal(0.0, 1e-3, state.size)
+        rival.covariance[:] = (2 + number) * state.covariance
+        inject(rival, error)
+        errors.append(error)
+        spreads.append(rival.covariance.copy())
+    before = state.copy()
+    rivals.mix(state)
+    expected = collapse(Mixture(np.array([1.0, *odds.values()]) / 2, np.array(errors), np.array(spreads)))
+    np.testing.assert_allclose(difference(state, before), expected.mean, atol=1e-8)
+    np.testing.assert_allclose(state.covariance, expected.covariance, rtol=1e-6, atol=1e-11)
+
+
+@pytest.mark.parametrize(("spoof", "reckoning"), [(3.0, 1.0), (1.0, 1.0), (1.0, 4.0)])
+def test_a_receiver_is_left_where_that_costs_less(spoof: float, reckoning: float) -> None:
+    """D5: a lie pulls the state by 6 m, dead reckoning has a sigma of 2 m. The rival without the receiver leads where its
+    expected loss is a tenth of the other's."""
+    needed = rivals.LEAD_BY_LOSS * (reckoning * 2.0) / (spoof * 6.0)
+    for odds, leads in ((0.98 * needed, False), (1.02 * needed, True)):
+        state, params, receiver = contested({rivals.RECEIVER: odds}, spoof_cost=spoof, dead_reckoning_cost=reckoning)
+        rival = state.hypothesis(rivals.RECEIVER)
+        rival.nominal[POSITION_E] += np.array([4.0, 4.0, -2.0])
+        rival.covariance[:] = 0.01 * np.eye(state.size)
+        rival.covariance[POSITION, POSITION] = 4 / 3 * np.eye(3)
+        place = rival.nominal[POSITION_E].copy()
+        rivals.decide(state, params)
+        assert bool(state.memory[receiver, EXCLUDED]) is leads
+        assert np.array_equal(state.nominal[POSITION_E], place) is leads
+        assert bool(state.bank[rivals.RECEIVER, 0] == 0) is leads
+
+
+@pytest.mark.parametrize(("spoof", "reckoning"), [(3.0, 1.0), (1.0, 1.0), (1.0, 4.0)])
+def test_a_receiver_is_followed_again_where_that_costs_less(spoof: float, reckoning: float) -> None:
+    """D5: the dearer a lie that is swallowed, the surer it must be that the state is wrong and the receiver right."""
+    needed = rivals.LEAD * spoof / reckoning
+    for odds, leads in ((0.98 * needed, False), (1.02 * needed, True)):
+        state, params, receiver = contested({rivals.RETURN: odds}, spoof_cost=spoof, dead_reckoning_cost=reckoning)
+        state.memory[receiver, EXCLUDED] = 1.0
+        rivals.decide(state, params)
+        assert bool(state.memory[receiver, EXCLUDED] == 0) is leads
+        assert bool(state.stamps[RESET_REASON] == ResetReason.SOURCE_RETURNED) is leads

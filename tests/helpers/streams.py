@@ -23,6 +23,7 @@ from fusiond.filter.state import (
     RESET_SOURCE,
     RESETS,
     RUNNING,
+    T_POSITION,
     VELOCITY_E,
     FilterState,
     ResetReason,
@@ -47,6 +48,12 @@ def ramp(t: Array, begin: float, length: float) -> Array:
     """From 0 to 1 in `length` seconds, smoothly."""
     u = np.clip((t - begin) / length, 0.0, 1.0)
     return u * u * (3 - 2 * u)
+
+
+def ramped(t: Array, begin: float, length: float) -> Array:
+    """The integral of a ramp over the time."""
+    u = np.clip((t - begin) / length, 0.0, 1.0)
+    return length * (u**3 - u**4 / 2) + np.clip(t - begin - length, 0.0, None)
 
 
 def config(wheels: Iterable[str] = WHEELS, **tables: dict[str, Any]) -> Config:
@@ -119,7 +126,11 @@ def town(duration: float, rate: float = 100.0, start: tuple[float, float, float]
         going = ramp(t, 3.0, 4.0) - ramp(t, 30.0, 5.0) + ramp(t, 40.0, 4.0)
         return going * (12.0 + 2.0 * np.sin(0.4 * t))
 
-    return drive(duration, speed, lambda t: 0.7 + 0.8 * np.sin(0.15 * t) * ramp(t, 3.0, 6.0), rate, start)
+    def yaw(t: Array) -> Array:
+        under_way = t - ramped(t, 33.0, 2.0) + ramped(t, 40.0, 2.0)  # it does not turn where it stands
+        return 0.7 + 0.8 * np.sin(0.15 * under_way) * ramp(t, 3.0, 6.0)
+
+    return drive(duration, speed, yaw, rate, start)
 
 
 def measurements(
@@ -195,7 +206,8 @@ def running_state(
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)
     state.auxiliary[[2, 8]] -= 9.8
-    state.stamps[PHASE], state.stamps[T] = RUNNING, T0
+    state.stamps[PHASE] = RUNNING
+    state.stamps[T] = state.stamps[T_POSITION] = T0
     return state
 
 

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Invalid, Measurement, Payload, WheelSpeed
-from fusiond.filter.state import PHASE, RUNNING, T
+from fusiond.filter.state import ALIVE, PHASE, RUNNING, T
 from tests.conftest import needs_compiled
-from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, town
+from tests.helpers.streams import MS, SECOND, T0, config, fuse, measurements, same_bits, same_state, town
 
 PREFIX_S, LENGTH_S = 2.0, 2.5  # of a case: first in order, so that the filter aligns; then shuffled
 QUIET = settings(deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
@@ -60,7 +60,6 @@ def configuration(case: Case) -> Config:
             "horizon_s": case["horizon_s"],
             "snapshot_interval_s": case["snapshot_interval_s"],
             "imu_gap_s": 0.1,
-            "gnss_reset_s": 0.7,
         },
         gnss=(gnss if learns else {})
         | {"position_correlation_s": case["correlation_s"], "velocity_correlation_s": case["correlation_s"]},
@@ -189,6 +188,50 @@ def test_bad_samples_are_rejected_in_any_order() -> None:
     fusion = fuse(configuration(case), prefix + arrival(events, case), True)
     assert 10 < fusion.outcomes()["imu0"]["REJECTED"] < 60
     check(case, compiled=True)
+
+
+def lies(events: list[Measurement], liar: str) -> list[Measurement]:
+    """The events with a receiver that jumps by 30 m, or a gyro that lies for half a second, 0.3 s after the first event."""
+    begin = events[0].t_ns + 300 * MS
+    held = []
+    for event in events:
+        payload: Payload | Invalid = event.payload
+        if liar == "receiver" and isinstance(payload, GnssPosition) and event.t_ns >= begin:
+            payload = msgspec.structs.replace(payload, latitude=payload.latitude + 30.0 / 6.4e6)
+        if liar == "gyro" and isinstance(payload, ImuSample) and begin <= event.t_ns < begin + SECOND // 2:
+            x, y, z = payload.angular_rate_b
+            payload = msgspec.structs.replace(payload, angular_rate_b=(x + 0.4, y, z))
+        held.append(msgspec.structs.replace(event, payload=payload))
+    return held
+
+
+@needs_compiled
+@pytest.mark.parametrize("liar", ["receiver", "gyro"])
+@pytest.mark.parametrize("interval_s", [0.0, 0.05])
+def test_shuffled_while_rivals_are_alive(liar: str, interval_s: float) -> None:
+    """Rivals begin, are weighed and lead in the middle of what is shuffled."""
+    case: Case = {"begin_s": 9.0, "horizon_s": 0.6, "snapshot_interval_s": interval_s, "imu_hole": False}
+    case |= {"correlation_s": 0.0}
+    alive = 0
+    for seed in range(20):
+        begin = T0 + 9 * SECOND
+        middle, end = begin + 4 * SECOND, begin + 7 * SECOND
+        prefix = [event for event in drive_events() if begin <= event.t_ns < middle]
+        events = lies([event for event in drive_events() if middle <= event.t_ns < end], liar)
+        in_order, shuffled = Fusion(configuration(case), True), Fusion(configuration(case), True)
+        for event in prefix + events:
+            in_order.fuse(event)
+            alive += int(in_order.history.head.stamps[ALIVE] > 0)
+        for number, event in enumerate(prefix + arrival(events, case | {"seed": seed})):
+            shuffled.fuse(event)
+            if number % (1 + seed % 3) == 0:
+                assert shuffled.history.head.stamps[T] <= shuffled.history.applied_ns
+        assert shuffled.history.rerun > 0
+        same_bits(in_order, shuffled)
+        for fusion in (in_order, shuffled):
+            assert fusion.solution_at(end).state is not None
+        same_state(in_order._predicted, shuffled._predicted)
+    assert alive > 100
 
 
 @needs_compiled

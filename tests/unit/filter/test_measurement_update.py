@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.events import GnssPosition, Measurement
+from fusiond.events import GnssVelocity, Measurement
 from fusiond.filter.measurement_update import (
     _solve,
     cholesky,
@@ -39,8 +39,8 @@ from fusiond.filter.strapdown import coast
 from fusiond.maths.rotation import matrix, quaternion_exp, skew
 from fusiond.maths.statistics import chi_square
 from fusiond.maths.typed import Array
-from fusiond.maths.wgs84 import geodetic
-from tests.helpers.streams import T0, apply, config, running_state
+from fusiond.maths.wgs84 import mat_ne
+from tests.helpers.streams import T0, apply, config, running_state, triple
 
 ALWAYS = math.inf  # a gate that lets everything pass
 PLACE = SCALE.start
@@ -126,8 +126,8 @@ def test_riccati_steady_state() -> None:
 
 def ill_conditioned(rng: np.random.Generator) -> Array:
     """A covariance of condition 1e12 with eigenvectors in all directions."""
-    turn, _ = np.linalg.qr(rng.normal(size=(18, 18)))
-    covariance: Array = turn @ np.diag(np.logspace(6, -6, 18)) @ turn.T
+    turn, _ = np.linalg.qr(rng.normal(size=(ERROR_SIZE, ERROR_SIZE)))
+    covariance: Array = turn @ np.diag(np.logspace(6, -6, ERROR_SIZE)) @ turn.T
     covariance[ATTITUDE] *= 1e-3  # of angles that there are
     covariance[:, ATTITUDE] *= 1e-3
     return (covariance + covariance.T) / 2
@@ -135,21 +135,22 @@ def ill_conditioned(rng: np.random.Generator) -> Array:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_joseph_form_keeps_an_ill_conditioned_covariance_positive(compiled: bool, seed: int) -> None:
-    """A fix of 1 um on a kilometre of doubt: the short form P - K H P leaves noise above the fix's variance, of either
-    sign; the filter's form leaves that variance, and a covariance that is positive to rounding."""
+    """A velocity of 1 um/s on a kilometre a second of doubt: the short form P - K H P leaves noise above its variance, of
+    either sign; the filter's form leaves that, and a covariance that is positive to rounding."""
     state = running_state(np.random.default_rng(seed))
     p = ill_conditioned(np.random.default_rng(seed))
     state.covariance[:] = p
-    sigma, h = 1e-6, np.eye(18)[POSITION]
+    sigma, h = 1e-6, np.eye(ERROR_SIZE)[VELOCITY]
     short = p - p @ h.T @ np.linalg.inv(h @ p @ h.T + sigma**2 * np.eye(3)) @ h @ p
-    assert np.abs(short[POSITION, POSITION] - sigma**2 * np.eye(3)).max() > sigma**2
-    settings = config(gnss={"position_sigma_m": sigma, "height_sigma_m": sigma})
+    assert np.abs(short[VELOCITY, VELOCITY] - sigma**2 * np.eye(3)).max() > sigma**2
+    settings = config(gnss={"velocity_sigma_mps": sigma})
     for k in range(1, 11):
-        fix = Measurement(T0, "gps0.position", k, T0, GnssPosition(*geodetic(state.nominal[POSITION_E])))
-        state.source_stamps[:] = NEVER  # so that a fix at the same instant is no duplicate
-        state.copy_from(apply(settings, state, [fix], compiled).history.head)
+        along_n = triple(mat_ne(state.nominal[POSITION_E]) @ state.nominal[VELOCITY_E])
+        heard = Measurement(T0, "gps0.velocity", k, T0, GnssVelocity(*along_n))
+        state.source_stamps[:] = NEVER  # so that a reading at the same instant is no duplicate
+        state.copy_from(apply(settings, state, [heard], compiled).history.head)
         np.testing.assert_array_equal(state.covariance, state.covariance.T)
-        seen = np.linalg.eigvalsh(state.covariance[POSITION, POSITION])
+        seen = np.linalg.eigvalsh(state.covariance[VELOCITY, VELOCITY])
         np.testing.assert_allclose(seen, sigma**2 / k, rtol=0.05)
         assert np.linalg.eigvalsh(state.covariance).min() > -np.finfo(float).eps * 1e6
 
@@ -253,8 +254,8 @@ def test_projection_and_whitening_against_matrices(m: int) -> None:
 def test_a_correction_turns_along_with_the_attitude() -> None:
     """P = M P M', with -[correction]x where M's rows of position and velocity meet its columns of attitude."""
     rng = np.random.default_rng(6)
-    state, error = running_state(rng), rng.normal(size=18)
-    turn = np.eye(18)
+    state, error = running_state(rng), rng.normal(size=ERROR_SIZE)
+    turn = np.eye(ERROR_SIZE)
     for block in (POSITION, VELOCITY):
         turn[block, ATTITUDE] = -skew(error[block])
     expected = turn @ state.covariance @ turn.T

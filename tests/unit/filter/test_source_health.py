@@ -239,14 +239,13 @@ def test_no_fault_no_alarm() -> None:
 def test_after_an_outage_it_is_believed_again() -> None:
     """Ten minutes without GNSS, then fixes that lie outside what the filter expected: not at once, but in 5 s."""
     truth = drive(70.0, lambda t: 10.0 + np.sin(0.3 * t), lambda t: 0.02 * t, rate=50.0)
-    settings = config(filter={"gnss_return_s": 3.0})
 
     def fixes(event: Measurement, t: float) -> Payload | None:
         if event.source.startswith("gps") and 15.0 <= t < 50.0:
             return None
         return shifted(event, 18.0 if t >= 50.0 else 0.0, 0.0)
 
-    fusion, shared = Fusion(settings), []
+    fusion, shared = Fusion(config()), []
     for event in faulty(truth, fixes):
         fusion.fuse(event)
         if event.t_ns > T0 + 55 * SECOND and event.source == "gps0.position":

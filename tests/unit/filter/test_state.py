@@ -12,6 +12,7 @@ from fusiond.filter.state import (
     CHOOSING,
     ERROR_SIZE,
     HYPOTHESES,
+    INERTIAL_DOUBT,
     MEMORY_SIZE,
     NEVER,
     NOMINAL_SIZE,
@@ -52,7 +53,7 @@ def test_each_nominal_state_has_its_place_behind_the_one_before() -> None:
         end = begin + width + (name == "QUATERNION_EB")
         assert getattr(state, name) == slice(begin, end), name
         begin = end
-    assert begin == NOMINAL_SIZE == WIDE_SIZE + 1
+    assert begin == INERTIAL_DOUBT == WIDE_SIZE + 1 == NOMINAL_SIZE - 1  # which no error adds to
     for nominal, error in zip(NOMINAL[5:], ERROR[5:], strict=True):
         assert getattr(state, nominal).start == getattr(state, error).start + 1
         assert getattr(state, error).start >= CALIBRATIONS

@@ -12,8 +12,14 @@ import pytest
 from fusiond.config.schema import Config
 from fusiond.engine import SECOND, Engine
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Received
+from fusiond.filter.state import RESET_SOURCE, ResetReason, count_reset
 from fusiond.messages import EventMessage, HealthMessage, InnovationMessage, Message
 from tests.helpers.live import configuration
+
+REASONS = {
+    ResetReason.SOURCE_RETURNED: "gps0.position: the state contradicted it and was likelier to be wrong; set to it",
+    ResetReason.INERTIAL_LIED: "the inertial sensor contradicted all others; its part was taken back",
+}
 
 
 class Player:
@@ -21,7 +27,7 @@ class Player:
 
     def __init__(self, settings: Config) -> None:
         self.published: list[Message] = []
-        self._engine = Engine(settings, self.published.append, rate_hz=10.0)
+        self.engine = Engine(settings, self.published.append, rate_hz=10.0)
 
     def play(self, seconds: float, begin_s: float = 0.0, metres_off: Callable[[float], float] = lambda _: 0.0) -> None:
         """A vehicle at rest; its receiver has an error to the north [m] by the second."""
@@ -32,30 +38,41 @@ class Player:
                 latitude = math.radians(48.0) + metres_off(second) / 6.4e6
                 self._feed("gps0.position", second + 1e-3, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
                 self._feed("gps0.velocity", second + 1e-3, GnssVelocity(0.0, 0.0, 0.0, 0.1))
-        self._engine.finish()
+        self.engine.finish()
 
     def _feed(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
         t_ns = 1_700_000_000 * SECOND + round(second * SECOND)
-        assert self._engine.feed(Received(source, t_ns, "unix", t_ns, t_ns, payload)) is not None
+        assert self.engine.feed(Received(source, t_ns, "unix", t_ns, t_ns, payload)) is not None
 
 
-def test_a_reset_is_published_with_its_reason(tmp_path: Path) -> None:
-    """A receiver with a constant error of 300 m is rejected, until the state is set to it."""
-    settings = configuration(tmp_path, "udpin:127.0.0.1:1")
-    settings = msgspec.structs.replace(settings, filter=msgspec.structs.replace(settings.filter, gnss_reset_s=10.0))
-    player = Player(settings)
-    player.play(16.0, metres_off=lambda second: 300.0 if second > 4 else 0.0)
+def test_a_jump_of_the_receiver_is_published(tmp_path: Path) -> None:
+    """A receiver with a constant error of 300 m for 5 s is rejected, and fused again when it is right again."""
+    player = Player(configuration(tmp_path, "udpin:127.0.0.1:1"))
+    player.play(15.0, metres_off=lambda second: 300.0 if 4 < second < 9 else 0.0)
     messages = player.published
-    why = "gps0.position: rejected with a constant error for too long; the state was set to it"
     events = [message for message in messages if isinstance(message, EventMessage)]
-    assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
     assert [message.subject for message in events if message.kind == "mode"] == [
         "aligning", "nominal", "dead_reckoning", "nominal",
     ]  # fmt: skip
+    assert not [message for message in events if message.kind == "reset"]
     positions = [m for m in messages if isinstance(m, InnovationMessage) and m.source == "gps0.position"]
     rejected = [message for message in positions if message.outcome == "rejected"]
-    assert len(rejected) > 40 and all((message.test_ratio or 0) > 1 for message in rejected)
+    assert len(rejected) >= 24 and all((message.test_ratio or 0) > 1 for message in rejected[:24])
     assert rejected[0].innovation[0] == pytest.approx(300, abs=2)
+    assert all(message.outcome == "fused" for message in positions[-20:])
+
+
+@pytest.mark.parametrize(("reason", "why"), REASONS.items(), ids=lambda value: getattr(value, "name", ""))
+def test_a_reset_is_published_with_its_reason(tmp_path: Path, reason: ResetReason, why: str) -> None:
+    player = Player(configuration(tmp_path, "udpin:127.0.0.1:1"))
+    player.play(3.0)
+    head = player.engine.fusion.history.head
+    count_reset(head, reason)
+    head.stamps[RESET_SOURCE] = player.engine.fusion.params.sources.index("gps0.position")
+    player.play(1.0, begin_s=3.0)
+    messages = player.published
+    events = [message for message in messages if isinstance(message, EventMessage)]
+    assert [message.text for message in events if message.kind == "reset"] == [f"state reset: {why}"]
     health = [message for message in messages if isinstance(message, HealthMessage)]
     assert (health[-1].resets, health[-1].reset_reason) == (1, why)
     jump = next(message for message in health if message.resets == 1)

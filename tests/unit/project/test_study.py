@@ -20,7 +20,7 @@ QUIET = {
     "filter": {"mount_sigma_deg": 1.0, "wheel_scale_sigma": 0.01, "heading_sigma_deg": 1e-4, "level_sigma_deg": 1e-4},
     "imu": dict.fromkeys(("accel_noise", "gyro_noise", "accel_bias_sigma", "gyro_bias_sigma"), SMALL),
     "gnss": dict.fromkeys(("position_sigma_m", "height_sigma_m", "velocity_sigma_mps"), 1e-3),
-    "wheel": {"sigma_mps": 1e-4},
+    "wheel": {"sigma_mps": 5e-3},  # less is below what scale and velocity, both off at the start, make as a product
 }
 
 

@@ -19,7 +19,6 @@ from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Measurement, Payload, WheelSpeed
 from fusiond.filter.kernel.interpreted import Kernel, compiled_available, make_kernel
-from fusiond.filter.measurement import SUSPECT
 from fusiond.filter.north_east_down import COVARIANCE_N, GEODETIC, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations.model import mat_eb
 from fusiond.filter.parameters import make_parameters
@@ -42,13 +41,10 @@ from fusiond.filter.state import (
     SCATTER_RATE,
     T_IMU,
     T_LAST,
-    T_REJECTED,
-    T_SAME_ERROR,
     T_STILL,
     VELOCITY_E,
     WIDE_SIZE,
     FilterState,
-    ResetReason,
 )
 from fusiond.maths.rotation import matrix, matrix_from_euler, quaternion
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
@@ -63,7 +59,6 @@ from tests.helpers.streams import (
     config,
     fuse,
     measurements,
-    reset_by,
     running_state,
     same_bits,
     same_state,
@@ -261,36 +256,6 @@ def test_imu_samples_too_far_apart_are_not_interpolated(apart_ms: int, coasts: b
     expected = state.nominal[POSITION_E] + state.nominal[VELOCITY_E] * apart_ms / 1e3
     assert bool(np.abs(head.nominal[POSITION_E] - expected).max() < 1e-8) is coasts
     assert bool(np.abs(head.nominal[QUATERNION_EB] - state.nominal[QUATERNION_EB]).max() < 1e-14) is coasts
-
-
-@pytest.mark.parametrize("kind", ["position", "velocity", "velocity 2-D"])
-def test_reset_after_a_long_rejection(kind: str) -> None:
-    settings = config(filter={"gnss_reset_s": 5.0}, gnss={"lever_arm_m": (0.4, -0.2, -1.1)})
-    rng = np.random.default_rng(5)
-    state = running_state(rng)
-    source = settings.sources().index(KINDS[kind])
-    far = {
-        "position": GnssPosition(0.85, 0.21, 400.0),
-        "velocity": GnssVelocity(90.0, -90.0, 9.0),
-        "velocity 2-D": GnssVelocity(90.0, -90.0),
-    }[kind]
-    first, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
-    state.memory[source] = first.history.head.memory[source]  # its innovation; it will be off by as much again
-    state.source_stamps[source, [T_LAST, T_REJECTED]] = T0 - 100 * MS
-    wait = 5 * SECOND if kind == "position" else SUSPECT * 5 * SECOND
-    for since, resets in ((wait, 1), (wait - 1, 0), (None, 0)):
-        state.source_stamps[source, T_SAME_ERROR] = NEVER if since is None else T0 - since
-        fusion, _ = both(settings, state, [Measurement(T0, KINDS[kind], 0, T0, far)])
-        reason = ResetReason.SOURCE_RETURNED if resets else ResetReason.NONE
-        assert reset_by(fusion) == (resets, reason, KINDS[kind] if resets else settings.sources()[0])
-        assert fusion.history.rows[0]["outcome"] == (Outcome.FUSED if resets else Outcome.REJECTED)
-        assert fusion.history.rows[0]["ratio"] > 1
-        assert np.linalg.eigvalsh(fusion.history.head.covariance).min() > 0
-        if resets and kind == "position":
-            head = fusion.history.head
-            antenna = head.nominal[POSITION_E] + mat_eb(head) @ (0.4, -0.2, -1.1)
-            latitude, longitude, _ = geodetic(antenna)
-            assert (latitude, longitude) == (pytest.approx(0.85, abs=0.01), pytest.approx(0.21, abs=0.01))
 
 
 @pytest.mark.parametrize("still", [True, False])

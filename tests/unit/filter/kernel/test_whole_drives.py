@@ -12,11 +12,14 @@ import pytest
 
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
-from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, Measurement, Payload, Pressure, WheelSpeed
+from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Measurement, Payload, Pressure, WheelSpeed
+from fusiond.filter.rivals import INERTIAL, RECEIVER, RIVALS
+from fusiond.filter.rivals import WHEELS as WHEELS_SLIP
 from fusiond.filter.state import (
     BLOWN,
     CHOOSING,
     DELAYS_ERROR,
+    EXCLUDED,
     HEIGHT_OFFSET_ERROR,
     NEVER,
     PHASE,
@@ -228,35 +231,69 @@ def test_a_state_that_is_not_finite(part: str, place: int, before: str) -> None:
     assert fusion.history.head.stamps[BLOWN] == 1
 
 
-def test_sources_that_are_locked_out() -> None:
-    """Position, velocity and height offset are put where their source says, after it was rejected for long."""
+def seen_alive(events: list[Measurement], settings: Config) -> tuple[set[int], Fusion]:
+    """Places in the bank that held a rival at any time; both kernels alike."""
+    met: set[int] = set()
+
+    def watch(head: FilterState, _: int) -> None:
+        met.update(slot for slot in range(RIVALS) if head.stamps[PHASE] == RUNNING and head.bank[slot, 0] > 0)
+
+    return met, both_kernels(settings, events, poison=watch)
+
+
+def test_a_spoofed_receiver() -> None:
+    """Positions pull away, velocities too from then on; at last all is right again."""
 
     def change(event: Measurement, t: float) -> Payload:
         payload = event.payload
-        if isinstance(payload, GnssPosition) and t > 6.0:
-            return msgspec.structs.replace(payload, latitude=payload.latitude + 1e-5)
-        if isinstance(payload, GnssVelocity) and t > 9.0:
-            return msgspec.structs.replace(payload, north=payload.north + 6.0)
+        if isinstance(payload, GnssPosition) and 9.0 < t < 19.0:
+            return msgspec.structs.replace(payload, latitude=payload.latitude + 3.0 * (t - 9.0) / 6.4e6)
+        if isinstance(payload, GnssVelocity) and 14.0 < t < 19.0:
+            return msgspec.structs.replace(payload, north=payload.north + 3.0)
         return payload
 
-    events = sensed(town(15.0, rate=25.0), change, wheels=())
-    events += [
-        Measurement(T0 + 7 * MS + k * 200 * MS, "baro", k, T0, Pressure(95_000.0 if k < 40 else 94_000.0, 290.0))
-        for k in range(75)
-    ]
-    settings = config(
-        (),
-        filter=HEADED | {"gnss_reset_s": 0.7, "gnss_return_s": 0.5},
-        motion={"non_holonomic": False},
-        barometer={"baro": {"link": "link", "sigma_m": 0.5}},
-    )
-    events.sort(key=lambda event: event.key)
-    early = fuse(settings, [event for event in events if event.t_ns < T0 + 9 * SECOND], True)
-    assert reset_by(early) == (1, ResetReason.SOURCE_RETURNED, "gps0.position")
-    fusion = both_kernels(settings, events)
-    assert reset_by(fusion)[0] > 1
-    assert fusion.outcomes()["gps0.velocity"]["REJECTED"] > 10
-    assert fusion.outcomes()["baro"]["FUSED"] > 60
+    met, fusion = seen_alive(sensed(town(24.0, rate=25.0), change), config(filter=HEADED))
+    assert RECEIVER in met
+    assert fusion.outcomes()["gps0.position"]["REJECTED"] > 10
+    assert not fusion.history.head.memory[:, EXCLUDED].any()
+
+
+def test_a_jump_of_the_fixes() -> None:
+    def change(event: Measurement, t: float) -> Payload:
+        payload = event.payload
+        if isinstance(payload, GnssPosition) and t > 9.0:
+            return msgspec.structs.replace(payload, latitude=payload.latitude + 100.0 / 6.4e6)
+        return payload
+
+    met, fusion = seen_alive(sensed(town(14.0, rate=25.0), change), config(filter=HEADED))
+    assert RECEIVER in met
+    assert fusion.outcomes()["gps0.position"]["REJECTED"] > 20
+
+
+@pytest.mark.parametrize("wide", [False, True], ids=["", "wide"])
+def test_an_inertial_sensor_that_lies(wide: bool) -> None:
+    def change(event: Measurement, t: float) -> Payload:
+        payload = event.payload
+        if isinstance(payload, ImuSample) and 9.0 < t < 10.0:
+            x, y, z = payload.angular_rate_b
+            return msgspec.structs.replace(payload, angular_rate_b=(x + 0.2, y, z))
+        return payload
+
+    settings = config(filter=HEADED, gnss=LEARNT if wide else {})
+    met, fusion = seen_alive(sensed(town(13.0, rate=25.0), change), settings)
+    assert met >= {INERTIAL, WHEELS_SLIP}
+    assert reset_by(fusion)[1] is ResetReason.INERTIAL_LIED
+
+
+def test_a_barometer_that_jumps() -> None:
+    """The height offset is put where its source says, after that was rejected for long."""
+    events = sensed(town(20.0, rate=25.0), wheels=())
+    for k in range(100):
+        pressure = (95_000.0 if k < 40 else 94_000.0) + 3.0 * math.sin(k)
+        events.append(Measurement(T0 + 7 * MS + k * 200 * MS, "baro", k, T0, Pressure(pressure, 290.0)))
+    settings = config((), filter=HEADED, barometer={"baro": {"link": "link", "sigma_m": 0.5}})
+    fusion = both_kernels(settings, sorted(events, key=lambda event: event.key))
+    assert fusion.outcomes()["baro"]["FUSED"] > 45
     assert fusion.outcomes()["baro"]["REJECTED"] > 2
 
 
@@ -293,7 +330,7 @@ def test_faulty_sources() -> None:
 def test_a_vehicle_that_is_carried(heading: dict[str, float]) -> None:
     """A ferry: wheels at rest while GNSS sees the vehicle move."""
     truth = drive(9.0, lambda t: 5.0 * ramp(t, 2.0, 4.0), lambda t: 0.7 + 0.1 * t, rate=25.0)
-    settings = config(filter=heading | {"gnss_reset_s": 2.0, "gnss_return_s": 1.0})
+    settings = config(filter=heading)
     fusion = both_kernels(
         settings, sensed(truth, lambda event, _: WheelSpeed(0.0) if isinstance(event.payload, WheelSpeed) else event.payload)
     )
