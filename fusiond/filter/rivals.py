@@ -334,7 +334,9 @@ def wrong(state: FilterState, carried: bool) -> float:
 @compiled
 def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
     """Give up rivals that have become unlikely, and let one lead where the expected loss is less so. While the wheels rest
-    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried."""
+    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it while it may well be
+    the state that is wrong."""
+    blamed = not disputed and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
     total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
@@ -365,7 +367,7 @@ def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
                 needed = LEAD_BY_LOSS * params.dead_reckoning_cost / params.spoof_cost * math.sqrt(blurred / apart)
             elif slot == RETURN:
                 needed = LEAD_BY_LOSS * params.spoof_cost / params.dead_reckoning_cost
-            if odds >= needed * against and not (disputed and slot == RECEIVER):
+            if odds >= needed * against and (blamed or slot != RECEIVER):
                 _lead(state, slot, params)
                 return
 

@@ -33,7 +33,7 @@ BAD: dict[str, tuple[tuple[float | None, ...], tuple[float | None, ...]]] = {  #
     "all gyros": ((None, None, None), (34.9, 34.9, 34.9)),
     "all accelerometers": ((159.0, 159.0, 159.0), (None, None, None)),
 }
-WORST_M = 0.3
+WORST_M = 0.5
 LATER = 3  # positions by which a start may be later, if a bad sample falls into it
 pytestmark = [
     pytest.mark.skipif(not DATA.is_dir(), reason="the captured drives are not beside the project"),

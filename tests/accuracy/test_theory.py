@@ -116,12 +116,12 @@ def test_rivals_are_weighed_by_bayes_rule() -> None:
     for main, *others in likelihoods:
         for slot, own in zip(prior, others, strict=True):
             rivals.weigh(state, slot, own, main)
-        rivals.decide(state, params)
+        rivals.decide(state, False, params)
     held = posterior(held, likelihoods)
     assert held[3] < rivals.BEGIN / 10
     found = [state.auxiliary[MAIN_WEIGHT], *state.bank[list(prior), 0]]
     np.testing.assert_allclose(found, [*held[:3], 0.0], rtol=1e-12)
-    rivals.decide(state, params)
+    rivals.decide(state, False, params)
     assert state.auxiliary[MAIN_WEIGHT] + state.bank[:, 0].sum() == pytest.approx(1.0, abs=1e-12)
 
 
@@ -156,7 +156,7 @@ def test_a_receiver_is_left_where_that_costs_less(spoof: float, reckoning: float
         rival.covariance[:] = 0.01 * np.eye(state.size)
         rival.covariance[POSITION, POSITION] = 4 / 3 * np.eye(3)
         place = rival.nominal[POSITION_E].copy()
-        rivals.decide(state, params)
+        rivals.decide(state, False, params)
         assert bool(state.memory[receiver, EXCLUDED]) is leads
         assert np.array_equal(state.nominal[POSITION_E], place) is leads
         assert bool(state.bank[rivals.RECEIVER, 0] == 0) is leads
@@ -165,10 +165,10 @@ def test_a_receiver_is_left_where_that_costs_less(spoof: float, reckoning: float
 @pytest.mark.parametrize(("spoof", "reckoning"), [(3.0, 1.0), (1.0, 1.0), (1.0, 4.0)])
 def test_a_receiver_is_followed_again_where_that_costs_less(spoof: float, reckoning: float) -> None:
     """D5: the dearer a lie that is swallowed, the surer it must be that the state is wrong and the receiver right."""
-    needed = rivals.LEAD * spoof / reckoning
+    needed = rivals.LEAD_BY_LOSS * spoof / reckoning
     for odds, leads in ((0.98 * needed, False), (1.02 * needed, True)):
         state, params, receiver = contested({rivals.RETURN: odds}, spoof_cost=spoof, dead_reckoning_cost=reckoning)
         state.memory[receiver, EXCLUDED] = 1.0
-        rivals.decide(state, params)
+        rivals.decide(state, False, params)
         assert bool(state.memory[receiver, EXCLUDED] == 0) is leads
         assert bool(state.stamps[RESET_REASON] == ResetReason.SOURCE_RETURNED) is leads

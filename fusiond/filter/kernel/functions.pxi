@@ -2808,6 +2808,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
+    cdef bint blamed
     cdef double total
     cdef int64_t slot
     cdef State hypothesis
@@ -2823,6 +2824,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     cdef double apart
     cdef double blurred
     cdef int64_t i
+    blamed = ((not disputed) and ((10.0 * state.bank[(2) * BLOCK + 0]) <= state.bank[(1) * BLOCK + 0]))
     total = state.auxiliary[40]
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
@@ -2855,7 +2857,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
                 needed = (((10.0 * params.dead_reckoning_cost) / params.spoof_cost) * sqrt((blurred / apart)))
             elif (slot == 2):
                 needed = ((10.0 * params.spoof_cost) / params.dead_reckoning_cost)
-            if ((odds >= (needed * against)) and (not (disputed and (slot == 1)))):
+            if ((odds >= (needed * against)) and (blamed or (slot != 1))):
                 rivals__lead(state, slot, params)
                 return
 

@@ -107,7 +107,7 @@ def test_mixing_keeps_the_moments() -> None:
 def test_the_weights_sum_to_one() -> None:
     state = contended(2)
     shares = np.array([state.auxiliary[MAIN_WEIGHT], *state.bank[: rivals.RIVALS, 0]])
-    rivals.decide(state, PARAMS)
+    rivals.decide(state, False, PARAMS)
     found = np.array([state.auxiliary[MAIN_WEIGHT], *state.bank[: rivals.RIVALS, 0]])
     np.testing.assert_allclose(found, shares / shares.sum(), rtol=1e-14)
     assert state.stamps[ALIVE] == 3
@@ -149,7 +149,7 @@ def test_none_begins_while_the_state_coasts() -> None:
 def test_a_rival_that_has_become_unlikely_is_given_up() -> None:
     state = contended(5)
     state.bank[rivals.RECEIVER, 0] = state.bank[rivals.WHEELS, 0] = 1e-9
-    rivals.decide(state, PARAMS)
+    rivals.decide(state, False, PARAMS)
     assert state.stamps[ALIVE] == 1
     assert not state.bank[[rivals.RECEIVER, rivals.WHEELS]].any()
 
@@ -160,7 +160,7 @@ def test_the_rival_of_a_liar_leads() -> None:
     state.bank[rivals.RECEIVER, 0] = 1e9
     rival = state.hypothesis(rivals.RECEIVER)
     place, covariance = rival.nominal.copy(), rival.covariance.copy()
-    rivals.decide(state, PARAMS)
+    rivals.decide(state, False, PARAMS)
     np.testing.assert_array_equal(state.nominal, place)
     np.testing.assert_array_equal(state.covariance, covariance)
     assert state.memory[[PLACE, SPEED], EXCLUDED].tolist() == [1.0, 1.0]
@@ -172,7 +172,7 @@ def test_a_receiver_that_was_right_leads_back() -> None:
     state = contended(7, (rivals.RETURN,))
     state.memory[[PLACE, SPEED], EXCLUDED] = 1.0
     state.bank[rivals.RETURN, 0] = 1e9
-    rivals.decide(state, PARAMS)
+    rivals.decide(state, False, PARAMS)
     assert not state.memory[:, EXCLUDED].any()
     assert state.stamps[RESET_SOURCE] == PLACE
     assert state.stamps[ALIVE] == 0
@@ -187,7 +187,7 @@ def leads(odds: float, **costs: float) -> bool:
     rival = state.hypothesis(rivals.RECEIVER)
     rival.nominal[POSITION_E.start] += 100.0
     rival.covariance[POSITION, POSITION] = np.diag([100.0] * 3)
-    rivals.decide(state, params)
+    rivals.decide(state, False, params)
     return bool(state.memory[PLACE, EXCLUDED])
 
 
