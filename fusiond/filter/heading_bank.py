@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from fusiond.filter.measurement import share_noise
-from fusiond.filter.measurement_update import cholesky, difference, inject, project, update_projected, whiten
+from fusiond.filter.measurement_update import difference, inject, project, update_projected
 from fusiond.filter.motion_constraints import (
     GNSS_FRESH_NS,
     NON_HOLONOMIC,
@@ -26,7 +26,8 @@ from fusiond.filter.motion_constraints import (
 from fusiond.filter.observations import WHEEL_SPEED, non_holonomic, observe, wheel_speed
 from fusiond.filter.observations.model import Observation, with_rate_noise
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS
+from fusiond.filter.rivals import likelihood
+from fusiond.filter.source_health import OUTLIERS
 from fusiond.filter.state import (
     ATTITUDE,
     HOT_START,
@@ -46,7 +47,6 @@ from fusiond.filter.state import (
     is_finite,
 )
 from fusiond.maths.linear import mirror
-from fusiond.maths.portable import exp
 from fusiond.maths.typed import ErrorRows3, Matrix3, Vector, compiled
 from fusiond.maths.wgs84 import mat_ne
 
@@ -55,27 +55,15 @@ FAR = math.radians(30.0)  # rad: a heading this far off is another one, not the 
 DOUBT = 1e-4  # the bank is not collapsed while headings that are far off are likelier than this, all together
 BANK_SIGMA = math.radians(12.0)  # rad, of each heading at first, at most: wide enough to overlap
 CLUTTER = OUTLIERS  # share of measurements that fit nothing
-MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 
 
 @compiled
 def weigh(state: FilterState, i: int, seen: Observation, factor: float, spread: Matrix3) -> None:
     """Multiply a hypothesis's weight by the likelihood of an observation, of H P H' (m, m), whose error it shares with those
     before."""
-    m = seen.m
-    lower, widened, whitened = np.empty((3, 3)), np.empty(3), np.empty(3)
-    for a in range(m):
-        widened[a] = factor * seen.variance[a]
-    if not cholesky(spread, widened, 1.0, m, lower) or not whiten(spread, seen.innovation, widened, m, whitened):
-        return
-    square, size = 0.0, 1.0
-    for a in range(m):
-        square += whitened[a] * whitened[a]
-        size *= lower[a, a]
-    lowest = exp(-min(square, MAX_SQUARE) / (2 * OUTLIER_VARIANCE))
-    for _a in range(m):
-        lowest /= math.sqrt(OUTLIER_VARIANCE)
-    state.bank[i, 0] *= ((1 - OUTLIERS) * exp(-square / 2) + OUTLIERS * lowest) / size
+    likely = likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
+    if likely > 0:
+        state.bank[i, 0] *= likely
 
 
 @compiled

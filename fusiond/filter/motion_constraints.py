@@ -41,7 +41,6 @@ SMOOTH_TIME = 0.08  # s, time constant of the mean force that delays are learnt 
 MEAN_FILLED = 0.8  # weight from which a mean is used: 0.8 s after its begin
 GNSS_FRESH_NS = 2 * SECOND  # a GNSS velocity older than this says nothing of being carried
 CARRIED_SPEED = 1.0  # m/s: slower than this no vehicle is called carried
-WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer says nothing of standing
 NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2  # rows of Parameters.constraints
 
 
@@ -91,7 +90,7 @@ def rests(state: FilterState, params: Parameters) -> bool:
     """Whether every wheel that was heard lately is at rest, and one was."""
     heard = False
     for i in params.wheels:
-        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS:
+        if state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS:
             heard = True
             if not abs(state.memory[i, LAST_SPEED]) <= params.still_wheel:
                 return False

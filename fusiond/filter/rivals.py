@@ -20,7 +20,7 @@ from fusiond.filter.measurement_update import cholesky, difference, inject, proj
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS, begin, distrust, is_trusted, odds_of_bias
+from fusiond.filter.source_health import MAX_SQUARE, OUTLIER_VARIANCE, OUTLIERS, begin, distrust, is_trusted, odds_of_bias
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ALIVE,
@@ -50,6 +50,7 @@ from fusiond.filter.state import (
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
 from fusiond.maths.typed import ErrorRows3, Matrix3, Vector3, compiled
+from fusiond.units import SECOND
 
 RIVALS = 4
 INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while the filter runs
@@ -62,12 +63,11 @@ LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, or goes whe
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
 MIN_WEIGHT = 1e-100
-MAX_SQUARE = 1000.0  # a squared innovation beyond is no stranger than this
 LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
 LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
 LIE_SPEED = 0.05  # m/s, by which the velocity may be off
 LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
-WHEEL_FRESH_NS = 500_000_000  # a wheel silent for longer says nothing
+WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer says nothing
 FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
 FIRST = 0.1  # of these variances, that a lie has for certain
 LARGER = 0.3  # chance that a lie is larger than that
@@ -91,10 +91,10 @@ def likelihood(innovation: Vector3, variance: Vector3, factor: float, m: int, sp
     for a in range(m):
         distance += whitened[a] * whitened[a]
         size *= lower[a, a]
-    outlier = OUTLIERS * exp(-min(distance, MAX_SQUARE) / (2 * OUTLIER_VARIANCE))
+    outlier = exp(-min(distance, MAX_SQUARE) / (2 * OUTLIER_VARIANCE))
     for _a in range(m):
-        outlier /= 10.0  # the root of OUTLIER_VARIANCE
-    return ((1 - OUTLIERS) * exp(-min(distance, MAX_SQUARE) / 2) + outlier) / size
+        outlier /= math.sqrt(OUTLIER_VARIANCE)
+    return ((1 - OUTLIERS) * exp(-distance / 2) + OUTLIERS * outlier) / size
 
 
 @compiled
@@ -278,11 +278,11 @@ def weigh(state: FilterState, slot: int, own: float, main: float) -> None:
 def weigh_liar(state: FilterState, source: int, lie: float, params: Parameters) -> None:
     """Weigh the rival that calls a source a liar by a reading of that, which as a lie has `lie` times the main state's
     likelihood."""
-    slot = RECEIVER
-    if params.models[source] == WHEEL_SPEED:
-        slot = WHEELS
-    elif position_of(source, params) < 0 or state.stamps[SUSPECT] != position_of(source, params):
-        return
+    slot = WHEELS
+    if params.models[source] != WHEEL_SPEED:
+        slot, position = RECEIVER, position_of(source, params)
+        if position < 0 or state.stamps[SUSPECT] != position:
+            return
     state.bank[slot, 0] *= min(lie, MAX_ODDS)
 
 

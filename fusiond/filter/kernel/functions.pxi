@@ -603,28 +603,10 @@ cdef void gnss_error__add(double* p, int64_t block, double* to_n, double north, 
 # ---------------- fusiond.filter.heading_bank
 
 cdef void heading_bank_weigh(State* state, int64_t i, Observation* seen, double factor, double* spread) noexcept nogil:
-    cdef int64_t m
-    cdef double lower[3 * 3]
-    cdef double widened[3]
-    cdef double whitened[3]
-    cdef int64_t a
-    cdef double square
-    cdef double size
-    cdef double lowest
-    cdef int64_t _a
-    m = seen.m
-    for a in range(m):
-        widened[a] = (factor * seen.variance[a])
-    if ((not measurement_update_cholesky(spread, widened, 1.0, m, lower)) or (not measurement_update_whiten(spread, seen.innovation, widened, m, whitened))):
-        return
-    square, size = 0.0, 1.0
-    for a in range(m):
-        square += (whitened[a] * whitened[a])
-        size *= lower[(a) * 3 + a]
-    lowest = portable_exp(((-(1000.0 if 1000.0 < square else square)) / (2 * 100.0)))
-    for _a in range(m):
-        lowest /= sqrt(100.0)
-    state.bank[(i) * BLOCK + 0] *= ((((1 - 0.01) * portable_exp(((-square) / 2))) + (0.01 * lowest)) / size)
+    cdef double likely
+    likely = rivals_likelihood(seen.innovation, seen.variance, factor, seen.m, spread)
+    if (likely > 0):
+        state.bank[(i) * BLOCK + 0] *= likely
 
 cdef void heading_bank_fuse(State* state, int64_t i, State* hypothesis, Observation* seen, double factor, Parameters* params, bint weighed) noexcept nogil:
     cdef double across[3 * n]
@@ -2567,10 +2549,10 @@ cdef double rivals_likelihood(double* innovation, double* variance, double facto
     for a in range(m):
         distance += (whitened[a] * whitened[a])
         size *= lower[(a) * 3 + a]
-    outlier = (0.01 * portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / (2 * 100.0))))
+    outlier = portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / (2 * 100.0)))
     for _a in range(m):
-        outlier /= 10.0
-    return ((((1 - 0.01) * portable_exp(((-(1000.0 if 1000.0 < distance else distance)) / 2))) + outlier) / size)
+        outlier /= sqrt(100.0)
+    return ((((1 - 0.01) * portable_exp(((-distance) / 2))) + (0.01 * outlier)) / size)
 
 cdef double rivals_unread(double* variance, double factor, int64_t m, double* spread) noexcept nogil:
     cdef double lower[3 * 3]
@@ -2763,11 +2745,12 @@ cdef void rivals_weigh(State* state, int64_t slot, double own, double main) noex
 
 cdef void rivals_weigh_liar(State* state, int64_t source, double lie, Parameters* params) noexcept nogil:
     cdef int64_t slot
-    slot = 1
-    if (params.models[source] == 2):
-        slot = 3
-    elif ((rivals_position_of(source, params) < 0) or (state.stamps[23] != rivals_position_of(source, params))):
-        return
+    cdef int64_t position
+    slot = 3
+    if (params.models[source] != 2):
+        slot, position = 1, rivals_position_of(source, params)
+        if ((position < 0) or (state.stamps[23] != position)):
+            return
     state.bank[(slot) * BLOCK + 0] *= (1000000000000.0 if 1000000000000.0 < lie else lie)
 
 cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* params) noexcept nogil:
