@@ -47,7 +47,7 @@ from fusiond.filter.state import (
 from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
 
 HORIZONTAL = 2  # axes of a fix that are judged together; its height is judged apart
-DOUBT_TIME = 30.0  # s: a height that is rejected for so long is believed
+DOUBT_TIME = 30.0  # s, after which a height that is rejected is fused
 OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
 
 
@@ -159,14 +159,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if state.stamps[ALIVE] > 0 and heard:
         unread = rivals.unread(seen.variance, weight, m, spread)
         main = fits if trusted else unread
-        chance = rivals.SHARE_OF_LIAR * unread / main if main > 0 else 1.0
-        lie = gained if by_rivals else rivals.SHARE_OF_LIAR
-        shared = 0.0 if ratio <= 1 else gained
-        best, returned = _fuse_rivals(state, source, values, factor * noisy, weight, main, shared, params)
-        lie = max(lie, returned)
-        if not ratio <= 1:
-            lie = max(lie, max(chance, best))  # noqa: PLW3301 - of two, for the kernel
-        rivals.weigh_liar(state, source, lie, params)
+        _weigh_rivals(state, source, values, factor * noisy, weight, main, unread, gained, ratio <= 1, params)
     if by_rivals and not doubtful:
         _suspect_receiver(state, source, values, params)
         if model == GNSS_POSITION and not fused:
@@ -230,14 +223,40 @@ def _judge(
         return
     if not gnss and state.stamps[ALIVE] > 0:
         return
-    trusted = source_health.is_trusted(memory) and not carried(state, memory[LAST_SPEED], params)
-    if model == WHEEL_SPEED and trusted and rivals.wheels_contradict(state, params):
+    wheel = model == WHEEL_SPEED and source_health.is_trusted(memory)
+    if wheel and not carried(state, memory[LAST_SPEED], params) and rivals.wheels_contradict(state, params):
         rivals.suspect_motion(state, rivals.BEGIN)
         return
     if source_health.is_due(stamps, t_ns, correlation):
         source_health.judge(memory, stamps, whitened, m, same, t_ns)
     elif gnss:
         source_health.look(memory, whitened, m, same)
+
+
+@compiled
+def _weigh_rivals(
+    state: FilterState,
+    source: int,
+    values: Vector,
+    factor: float,
+    weight: float,
+    main: float,
+    unread: float,
+    gained: float,
+    agrees: bool,
+    params: Parameters,
+) -> None:
+    """Weigh and update the rivals by a reading, and weigh the one that calls its source a liar. `main` is the reading's
+    likelihood under the main state, `unread` what it has on average where it is used, `gained` by what the source has become
+    likelier to be biased, `agrees` whether the reading lies inside the main state's gate."""
+    lie = gained if params.models[source] in (GNSS_POSITION, GNSS_VELOCITY) else rivals.SHARE_OF_LIAR
+    shared = 0.0 if agrees else gained
+    best, returned = _fuse_rivals(state, source, values, factor, weight, main, shared, params)
+    lie = max(lie, returned)
+    if not agrees:
+        chance = rivals.SHARE_OF_LIAR * unread / main if main > 0 else 1.0
+        lie = max(lie, max(chance, best))  # noqa: PLW3301 - of two, for the kernel
+    rivals.weigh_liar(state, source, lie, params)
 
 
 @compiled

@@ -1212,13 +1212,6 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double gained
     cdef double unread
     cdef double main
-    cdef double chance
-    cdef double lie
-    cdef double shared
-    cdef (double, double) _t4
-    cdef double best
-    cdef double returned
-    cdef double _t5
     cdef int64_t slot
     cdef State rival
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
@@ -1290,17 +1283,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     if ((state.stamps[22] > 0) and heard):
         unread = rivals_unread(seen.variance, weight, m, spread)
         main = (fits if trusted else unread)
-        chance = (((0.1 * unread) / main) if (main > 0) else 1.0)
-        lie = (gained if by_rivals else 0.1)
-        shared = (0.0 if (ratio <= 1) else gained)
-        _t4 = measurement__fuse_rivals(state, source, values, (factor * noisy), weight, main, shared, params)
-        best = _t4[0]
-        returned = _t4[1]
-        lie = (returned if returned > lie else lie)
-        if (not (ratio <= 1)):
-            _t5 = (best if best > chance else chance)
-            lie = (_t5 if _t5 > lie else lie)
-        rivals_weigh_liar(state, source, lie, params)
+        measurement__weigh_rivals(state, source, values, (factor * noisy), weight, main, unread, gained, (ratio <= 1), params)
     if (by_rivals and (not doubtful)):
         measurement__suspect_receiver(state, source, values, params)
         if ((model == 0) and (not fused)):
@@ -1343,7 +1326,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     cdef bint gnss
     cdef double distance
     cdef int64_t a
-    cdef bint trusted
+    cdef bint wheel
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
     model = params.models[source]
@@ -1358,14 +1341,34 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
         return
     if ((not gnss) and (state.stamps[22] > 0)):
         return
-    trusted = (source_health_is_trusted(memory) and (not motion_constraints_carried(state, memory[0], params)))
-    if ((model == 2) and trusted and rivals_wheels_contradict(state, params)):
+    wheel = ((model == 2) and source_health_is_trusted(memory))
+    if (wheel and (not motion_constraints_carried(state, memory[0], params)) and rivals_wheels_contradict(state, params)):
         rivals_suspect_motion(state, 0.01)
         return
     if source_health_is_due(stamps, t_ns, correlation):
         source_health_judge(memory, stamps, whitened, m, same, t_ns)
     elif gnss:
         source_health_look(memory, whitened, m, same)
+
+cdef void measurement__weigh_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, double unread, double gained, bint agrees, Parameters* params) noexcept nogil:
+    cdef double lie
+    cdef double shared
+    cdef (double, double) _t1
+    cdef double best
+    cdef double returned
+    cdef double chance
+    cdef double _t2
+    lie = (gained if (params.models[source] == 0 or params.models[source] == 1) else 0.1)
+    shared = (0.0 if agrees else gained)
+    _t1 = measurement__fuse_rivals(state, source, values, factor, weight, main, shared, params)
+    best = _t1[0]
+    returned = _t1[1]
+    lie = (returned if returned > lie else lie)
+    if (not agrees):
+        chance = (((0.1 * unread) / main) if (main > 0) else 1.0)
+        _t2 = (best if best > chance else chance)
+        lie = (_t2 if _t2 > lie else lie)
+    rivals_weigh_liar(state, source, lie, params)
 
 cdef (double, double) measurement__fuse_rivals(State* state, int64_t source, double* values, double factor, double weight, double main, double gained, Parameters* params) noexcept nogil:
     cdef double _t1
