@@ -27,7 +27,7 @@ from fusiond.messages.info import config_table
 from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond.units import SECOND
 from fusiond_adapters.foxglove.converter import SHOWN, Channel, Converter, Record, channels
-from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, file_name, make_room, name_pattern
+from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, BoundedFolder
 
 try:
     from mcap import records
@@ -41,7 +41,6 @@ except ModuleNotFoundError as missing:
 CHUNK_BYTES = 1 << 20  # largest chunk
 LIBRARY = f"fusiond {__version__}"
 KIND = "fusion.mcap"
-NAME = name_pattern(re.escape(KIND))  # nothing else in the folder is ever removed
 MAX_WAITING = 4096  # messages between the estimator and the disk
 
 
@@ -178,7 +177,8 @@ class McapRecorder:
         self.lost = self.files = 0
         self._folder, self._config = folder, config
         section = config.mcap
-        self._file_bytes, self._total_bytes = int(section.file_mb * MEGABYTE), int(section.total_mb * MEGABYTE)
+        self._file_bytes = int(section.file_mb * MEGABYTE)
+        self._bounded = BoundedFolder(folder, re.escape(KIND), self._file_bytes, int(section.total_mb * MEGABYTE))
         self._converter = Converter(section.rate_hz)
         self._file: McapFile | None = None
         self._ended = 0  # records in the files before it
@@ -228,8 +228,7 @@ class McapRecorder:
         if self._file and self._file.written and self._file.size + 2 * self._chunk > self._file_bytes:
             self._leave_file(McapFile.close)
         if self._file is None:
-            make_room(self._folder, NAME, self._file_bytes, self._total_bytes)
-            self._file = McapFile(self._folder / file_name(record.publish_ns, KIND), self._config)
+            self._file = McapFile(self._bounded.new_file(record.publish_ns, KIND), self._config)
             self.files += 1
         size = self._file.size
         self._file.add(record)

@@ -1,24 +1,27 @@
 """The black box: records everything received, in native formats, in a folder of bounded size.
 
-A file is named by the instant of its first frame, then `LINK.tlog`, `can.log`, or `state.json` for the stored state that
-the run started with. The caller never waits: a thread writes the frames. If the disk is full or slow, only the black box
-loses frames: it counts them, and starts a new file as soon as possible.
+A file is named by the number of the recording, the instant of its first frame, and `LINK.tlog`, `can.log`, or `state.json`
+for the stored state that the run started with. The caller never waits: a thread writes the frames, and each second syncs
+them to the disk. Only then do they count as written. If the disk is full or slow, only the black box loses frames: it counts
+them, and starts a new file as soon as possible.
 """
 
 from __future__ import annotations
 
+import os
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from threading import Condition, Thread
 from types import TracebackType
-from typing import BinaryIO
 
 from fusiond.units import SECOND
-from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, file_name, make_room, name_pattern
+from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, BoundedFolder, sync_folder
 
 MAX_WAITING = 100_000  # records between the engine and the disk
+GATHERED = 1 << 16  # bytes that are written at once
 RETRY_NS = 5 * SECOND  # pause after an error; records of that time are lost
-NAME = name_pattern(r"\w+\.(tlog|log|json)")  # nothing else in the folder is ever removed
+KIND = r"\w+\.(?:tlog|log|json)"
 
 
 class Recorder:
@@ -29,31 +32,50 @@ class Recorder:
 
     def __init__(self, folder: Path, file_mb: float, total_mb: float) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.written = self.lost = 0  # records
+        self.written = 0  # records on the disk
         self.error: str | None = None  # the last one, until a write succeeds
-        self._folder = folder
-        self._file_bytes, self._total_bytes = int(file_mb * MEGABYTE), int(total_mb * MEGABYTE)
-        self._files: dict[str, tuple[BinaryIO, int]] = {}  # by kind: the open file, and its size
+        self._overflowed = self._lost = 0  # records: counted by the caller's thread, and by its own
+        self._file_bytes = int(file_mb * MEGABYTE)
+        self._folder = BoundedFolder(folder, KIND, self._file_bytes, int(total_mb * MEGABYTE))
+        self._files: dict[str, _File] = {}  # open ones, by kind
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         self._changed = Condition()
         self._ending = False
         self._next_try_ns = 0  # records stamped earlier are lost
-        self._last_ns = 0  # stamp of the last record given to a file
+        self._last_ns = 0  # stamp of the last record that was to be written
         self._thread = Thread(target=self._run, name="record")
         self._thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Records that are not on the disk, and will not be."""
+        return self._overflowed + self._lost
+
+    @property
+    def removed(self) -> int:
+        """Files of this recording that made room for later ones: it alone is larger than the limit."""
+        return self._folder.removed
+
+    def counts(self) -> tuple[int, int, int]:
+        """Records written, records lost, and own files removed."""
+        return self.written, self.lost, self.removed
 
     def add(self, kind: str, t_ns: int, record: bytes) -> None:
         """Hand over a record of a kind of file (`LINK.tlog`, `can.log`). Never waits."""
         if len(self._waiting) >= MAX_WAITING:
-            self.lost += 1
+            self._overflowed += 1
         else:
             self._waiting.append((kind, t_ns, record))
 
-    def close(self) -> None:
-        """Write the waiting records, and end."""
+    def end(self) -> None:
+        """Nothing will be added: its thread writes the waiting records, and ends. Does not wait for it."""
         with self._changed:
             self._ending = True
             self._changed.notify()
+
+    def close(self) -> None:
+        """Write the waiting records, and end."""
+        self.end()
         self._thread.join()
 
     def _run(self) -> None:
@@ -62,54 +84,62 @@ class Recorder:
                 ending = self._ending or self._changed.wait_for(lambda: self._ending, FLUSH_S)
             while self._waiting:
                 self._write(*self._waiting.popleft())
-            try:
-                for file, _ in self._files.values():
-                    file.flush()
-            except OSError as error:
-                self._fail(error, self._last_ns)
+            self._sync()
             if ending:
                 self._close_files()
                 return
 
     def _write(self, kind: str, t_ns: int, record: bytes) -> None:
         if t_ns < self._next_try_ns:
-            self.lost += 1
+            self._lost += 1
             return
+        self._last_ns = t_ns
         try:
-            file, size = self._files.get(kind) or (None, 0)
-            if file is not None and size + len(record) > self._file_bytes:
-                del self._files[kind]
-                file.close()
-                file = None
-            if file is None:
-                file, size = self._open(kind, t_ns), 0
-            self._files[kind] = file, size + len(record)
-            self._last_ns = t_ns
-            file.write(record)
+            file = self._file_with_room(kind, len(record), t_ns)
         except OSError as error:
-            self.lost += 1
-            self._fail(error, t_ns)
+            self._lost += 1
+            self._fail(error)
         else:
-            self.written += 1
-            self.error = None
+            file.add(record)
 
-    def _open(self, kind: str, t_ns: int) -> BinaryIO:
-        open_files = {Path(file.name) for file, _ in self._files.values()}
-        make_room(self._folder, NAME, self._file_bytes, self._total_bytes, open_files)
-        return (self._folder / file_name(t_ns, kind)).open("wb", buffering=1 << 16)
+    def _file_with_room(self, kind: str, size: int, t_ns: int) -> _File:
+        file = self._files.get(kind)
+        if file is not None and file.size + size > self._file_bytes:
+            self._close(self._files.pop(kind))
+            file = None
+        if file is None:
+            open_files = {other.path for other in self._files.values()}
+            file = self._files[kind] = _File(self._folder.new_file(t_ns, kind, open_files))
+        elif file.gathered >= GATHERED:
+            file.write()
+        return file
 
-    def _fail(self, error: OSError, t_ns: int) -> None:
-        self.error = error.strerror or str(error)
-        self._next_try_ns = t_ns + RETRY_NS
+    def _sync(self) -> None:
+        try:
+            for file in self._files.values():
+                self.written += file.sync()
+                self.error = None
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self._next_try_ns = self._last_ns + RETRY_NS
         self._close_files()
+        self.error = error.strerror or str(error)
 
     def _close_files(self) -> None:
-        for file, _ in self._files.values():
-            try:
-                file.close()
-            except OSError as error:  # buffered records are lost
-                self.error = error.strerror or str(error)
+        for file in self._files.values():
+            self._close(file)
         self._files.clear()
+
+    def _close(self, file: _File) -> None:
+        """Close a file; its records are now on the disk, or lost."""
+        try:
+            self.written += file.sync()
+        except OSError as error:
+            self.error = error.strerror or str(error)
+            self._lost += file.unsynced
+        file.close()
 
     def __enter__(self) -> Recorder:
         return self
@@ -118,3 +148,53 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class _File:
+    """A new file of whole records. Raises OSError, also in `write` and `sync`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = 0  # with the records that are not written yet [bytes]
+        self.unsynced = 0  # records that a power failure would take
+        self._synced_size = 0
+        self._gathered = bytearray()
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+
+    @property
+    def gathered(self) -> int:
+        """Bytes that are not written yet."""
+        return len(self._gathered)
+
+    def add(self, record: bytes) -> None:
+        """Gather a record."""
+        self._gathered += record
+        self.size += len(record)
+        self.unsynced += 1
+
+    def write(self) -> None:
+        """Write what was gathered, without syncing it."""
+        while self._gathered:
+            del self._gathered[: os.write(self._file, self._gathered)]
+
+    def sync(self) -> int:
+        """Write, and sync to the disk. Returns the number of records that have come onto the disk by this."""
+        if not self.unsynced:
+            return 0
+        self.write()
+        os.fdatasync(self._file)
+        if not self._synced_size:
+            sync_folder(self.path.parent)  # so that the name survives a power failure
+        self._synced_size = self.size
+        synced, self.unsynced = self.unsynced, 0
+        return synced
+
+    def close(self) -> None:
+        """Close it, without the records that could not be synced; without any the file is removed."""
+        with suppress(OSError):  # those records are lost either way
+            os.ftruncate(self._file, self._synced_size)
+        with suppress(OSError):
+            os.close(self._file)
+        if not self._synced_size:
+            with suppress(OSError):
+                self.path.unlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import resource
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -36,6 +37,7 @@ from pymavlink.dialects.v20 import common
 from fusiond.ports.outputs import OutputLost
 from fusiond_adapters import mcap as ours
 from fusiond_adapters.foxglove.converter import Converter, Record
+from fusiond_adapters.host.bounded_folder import BoundedFolder
 from fusiond_adapters.logs.play import mavlink_records
 from fusiond_adapters.logs.tlog import STAMP
 from fusiond_adapters.mcap import McapFile, McapRecorder, repair
@@ -314,12 +316,13 @@ def test_the_recorder_writes_what_a_replay_writes(replayed: tuple[Read, list[str
     (file,) = files_of(tmp_path)
     assert not lost and read(file) == replayed[0][: len(read(file))]
     assert output.counts() == {"records": len(read(file)), "records lost": 0, "files": 1}
-    assert ours.NAME.fullmatch(file.name)
+    assert re.fullmatch(r"0001-\d{8}T\d{6}\.\d{6}Z-fusion\.mcap", file.name)
 
 
 def test_files_follow_one_another_within_their_limit(tmp_path: Path) -> None:
     output = recorder(tmp_path, file_mb=0.5, total_mb=1)
-    output._file_bytes, output._total_bytes = 300_000, 800_000  # less than one may configure: the drive is short
+    output._file_bytes = 300_000  # less than one may configure: the drive is short
+    output._bounded = BoundedFolder(tmp_path / "out", re.escape(ours.KIND), 300_000, 800_000)
     mine = tmp_path / "out" / "mine.mcap"
     mine.parent.mkdir()
     mine.write_bytes(bytes(1_000_000))
