@@ -45,13 +45,13 @@ class CanBus:
         self._channel = config.can[bus].log_channel or bus
         self._config, self._clock = config, clock
         self._driver: CanDriver | None = None
-        self.configure(config)
-
-    def configure(self, config: Config) -> None:
-        """Use interface and channel of a configuration from the next session."""
-        settings = self._settings = config.can[self.name]
+        settings = self._settings = config.can[bus]
         where = " ".join(filter(None, (settings.interface, settings.channel, settings.config_context)))
-        self.about = f"CAN {self.name} ({where or 'as python-can is configured'})"
+        self.about = f"CAN {bus} ({where or 'as python-can is configured'})"
+
+    def adopt(self, fresh: CanBus) -> None:
+        """Use interface and channel of another bus from the next session."""
+        self._settings, self.about = fresh._settings, fresh.about
 
     def prepare(self) -> None:
         """Load the DBC files. Raises ConfigError if they do not fit."""

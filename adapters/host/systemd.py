@@ -41,7 +41,7 @@ class Notifier:
         if self._socket is None:
             return
         try:
-            self._socket.sendto("\n".join(lines).encode(), self._address)
+            self._socket.sendto("\n".join(" ".join(line.splitlines()) for line in lines).encode(), self._address)
         except OSError:
             self.lost += 1
 

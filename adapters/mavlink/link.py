@@ -39,17 +39,17 @@ class MavlinkLink:
         self._clock, self._alive = clock, alive
         self._sending = Lock()  # guards packing, and the transport while it is written to
         self._transport: Transport | None = None
-        self.configure(config)
-
-    def configure(self, config: Config) -> None:
-        """Use connection, own ids and requests of a configuration from the next session on. Raises ConfigError."""
-        settings = config.mavlink[self.name]
+        settings = config.mavlink[link]
         try:
             self._open = opener(settings.connection, settings.baud)
         except ValueError as error:
-            raise ConfigError(f"mavlink.{self.name}.connection: {error}") from error
-        self.about = f"MAVLink {self.name} ({settings.connection})"
-        self.housekeeping = Housekeeping(config, self.name)
+            raise ConfigError(f"mavlink.{link}.connection: {error}") from error
+        self.about = f"MAVLink {link} ({settings.connection})"
+        self.housekeeping = Housekeeping(config, link)
+
+    def adopt(self, fresh: MavlinkLink) -> None:
+        """Use connection, own ids and requests of another link from the next session on."""
+        self._open, self.about, self.housekeeping = fresh._open, fresh.about, fresh.housekeeping
 
     def prepare(self) -> None:
         """Nothing to load."""

@@ -11,9 +11,8 @@ from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, Self, TypeVar
 
-from fusiond.config.schema import Config
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
 
@@ -91,8 +90,9 @@ class LiveInput(Protocol[Item]):
     file: str  # name of the log of its frames, without the date
     inbox: Inbox[Item]
 
-    def configure(self, config: Config) -> None:
-        """Use a new configuration from the next session. Raises ConfigError."""
+    def adopt(self, fresh: Self) -> None:
+        """Use from the next session what a reload may change, of an input made and prepared with a new configuration. Cannot
+        fail."""
 
     def prepare(self) -> None:
         """Load what is slow to load, once, before the first session. Raises ConfigError."""

@@ -195,7 +195,12 @@ class Endpoint:
 def link_to(peer: Peer, folder: Path, more: str = "") -> tuple[Config, MavlinkLink]:
     """A link to a peer."""
     settings = configuration(folder, peer.connection, more)
-    return settings, MavlinkLink(settings, "fc", Inbox(4096, lambda: None, hash), CLOCK, lambda: True)
+    return settings, link_of(settings)
+
+
+def link_of(settings: Config) -> MavlinkLink:
+    """The link of a configuration."""
+    return MavlinkLink(settings, "fc", Inbox(4096, lambda: None, hash), CLOCK, lambda: True)
 
 
 class Recorder:

@@ -84,7 +84,8 @@ class Daemon:
         self._load, self._sinks = load, sinks
         self._stopping = Event()
         self._over = asyncio.Event()  # the estimator has ended
-        self._recorder: Recorder | None = None
+        self._recorders: list[Recorder] = []  # of this run, one after the other
+        self._refused: str | None = None  # why the last reload was refused
         self._mode: str | None = None
         self._logged: dict[str, int] = {}  # losses as last logged
         self._notifier = Notifier()
@@ -101,9 +102,9 @@ class Daemon:
     async def run(self) -> None:
         """Run until `stop` is called. Raises OSError if the black box's folder cannot be created, ConfigError if the
         configuration does not fit its DBC files; readiness is then never reported."""
-        self._open_recorder()
-        if self._recorder and self._state_file and self._state_file.stored:
-            self._recorder.add("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
+        self._record_with(self._make_recorder(self.config))
+        if self.live.record and self._state_file and self._state_file.stored:
+            self.live.record("state.json", self.clock.now_ns(), to_text(self._state_file.stored))
         executor = ThreadPoolExecutor(max_workers=POOL, thread_name_prefix="fusiond")
         try:
             self.inputs.start()
@@ -121,8 +122,8 @@ class Daemon:
             executor.shutdown(wait=True)
             self.inputs.join()
             self.outputs.join()
-            if self._recorder:
-                self._recorder.close()
+            for recorder in self._recorders:
+                recorder.close()
             self._notifier.close()
         if self.inputs.fault:
             raise self.inputs.fault
@@ -217,15 +218,17 @@ class Daemon:
         """The status in one line."""
         latency = self.outputs.handed_over.report()
         late = "" if latency is None else f", latency p50 {latency.p50:g} ms p99 {latency.p99:g} ms"
-        return f"{self._mode or 'no data yet'}, {self.live.offered} measurements, {self.published} published{late}"
+        refused = f"; reload refused: {self._refused}" if self._refused else ""
+        return f"{self._mode or 'no data yet'}, {self.live.offered} measurements, {self.published} published{late}{refused}"
 
     def _io_health(self) -> IoHealth:
         """Health of inputs and outputs, and latencies, for the health message."""
         outputs = self.outputs.health()
-        if recorder := self._recorder:
-            notes = {"error": recorder.error} if recorder.error else {}
-            offered = recorder.written + recorder.lost
-            outputs["record"] = OutputHealth(offered=offered, dropped=recorder.lost, counts={}, notes=notes)
+        if self._recorders:
+            written, lost, removed = (sum(counts) for counts in zip(*(one.counts() for one in self._recorders), strict=True))
+            notes = {"error": error} if (error := self._recorders[-1].error) else {}
+            counts = {"records written": written, "own files removed": removed}
+            outputs["record"] = OutputHealth(offered=written + lost, dropped=lost, counts=counts, notes=notes)
         if file := self._state_file:
             outputs["state"] = file.health(self.live.engine.fusion.hot_start())
         latency = LatencyHealth(fused=self.live.to_fusion.report(), published=self.outputs.handed_over.report())
@@ -238,7 +241,9 @@ class Daemon:
         found |= {f"{name} messages dropped": dropped for name, dropped in self.outputs.dropped().items()}
         found["stamps moved"] = self.live.moved
         found["states not stored"] = self._state_file.lost if self._state_file else 0
-        return found | {"records lost": self._recorder.lost if self._recorder else 0}
+        found["records lost"] = sum(one.lost for one in self._recorders)
+        found["files of this very recording removed"] = sum(one.removed for one in self._recorders)
+        return found
 
     def _report_losses(self) -> None:
         """Log the losses since the last report."""
@@ -246,47 +251,63 @@ class Daemon:
         new = {name: count - self._logged.get(name, 0) for name, count in losses.items() if name != "stamps moved"}
         text = ", ".join(f"{count} {name}" for name, count in new.items() if count)
         if text:
-            disks = (("black box", self._recorder), ("state file", self._state_file))
+            disks = (("black box", self._recorders[-1] if self._recorders else None), ("state file", self._state_file))
             why = "".join(f"; {name}: {disk.error}" for name, disk in disks if disk and disk.error)
             log.warning("in the last %g s: %s%s", REPORT_S, text, why, extra={"MESSAGE_ID": journal.DATA_LOST})
         self._logged = losses
 
     def reload(self) -> None:
-        """Apply the changes of the configuration file that can be made live; refuse all if there is any other change."""
+        """Apply the changes of the configuration file that can be made live. If there is any other change, or any error,
+        nothing changes at all."""
         if self._load is None:
             return
         self._notifier.reloading()
         try:
-            new = self._load()
-            for one in self._make_inputs(new).values():  # raises any error before anything is changed
-                one.prepare()
-            found = changes(self.config, new)
-            if found.refused:
-                log.error("reload refused: a restart is needed to change %s", ", ".join(found.refused))
-            else:
-                self._adopt(new, found.taken)
-                text = ", ".join(found.taken) or "nothing has changed"
-                log.info("reloaded: %s", text, extra={"MESSAGE_ID": journal.RELOADED})
+            self._refused = self._reload(self._load)
         except (ConfigError, OSError) as error:
-            log.error("reload refused: %s", error)
-        self.reloads += 1
-        self._notifier.ready(self.status())
+            self._refused = str(error)
+        except Exception as fault:  # the daemon goes on with what it has, whatever is wrong with the new configuration
+            self._refused = f"failed: {fault!r}"
+            log.exception("reload failed")
+        finally:
+            if self._refused:
+                log.error("reload refused: %s", self._refused)
+            self.reloads += 1
+            self._notifier.ready(self.status())
 
-    def _adopt(self, new: Config, keys: Sequence[str]) -> None:
-        self.inputs.configure(new, keys)
+    def _reload(self, load: Callable[[], Config]) -> str | None:
+        """Returns why the changes are refused, if they are. Whatever can fail comes before the first change."""
+        new = load()
+        found = changes(self.config, new)
+        if found.refused:
+            return f"a restart is needed to change {', '.join(found.refused)}"
+        inputs = self._make_inputs(new)
+        for one in inputs.values():
+            one.prepare()
+        record = any(key.startswith("record.") for key in found.taken)
+        recorder = self._make_recorder(new) if record else None
         self.config = new
+        self.inputs.adopt(inputs, found.taken)
+        if record:
+            self.estimator.ask(lambda: self._record_with(recorder))
         self.outputs.introduce()
-        if any(key.startswith("record.") for key in keys):
-            last = self._recorder
-            self._open_recorder()
-            if last:
-                self.estimator.ask(last.close)  # the estimator may be adding to it now
+        log.info("reloaded: %s", ", ".join(found.taken) or "nothing has changed", extra={"MESSAGE_ID": journal.RELOADED})
+        return None
 
-    def _open_recorder(self) -> None:
-        section, self._recorder = self.config.record, None
-        if section.folder is not None:
-            self._recorder = Recorder(self.config.path(section.folder), section.file_mb, section.total_mb)
-        self.live.record = self._recorder.add if self._recorder else None
+    def _make_recorder(self, config: Config) -> Recorder | None:
+        """The recorder of a configuration; None if nothing shall be recorded. Raises OSError."""
+        section = config.record
+        if section.folder is None:
+            return None
+        return Recorder(config.path(section.folder), section.file_mb, section.total_mb)
+
+    def _record_with(self, recorder: Recorder | None) -> None:
+        """Record with another recorder from now on, or not at all. Not while the estimator may be adding to the last one."""
+        if self._recorders:
+            self._recorders[-1].end()
+        if recorder:
+            self._recorders.append(recorder)
+        self.live.record = recorder.add if recorder else None
 
 
 async def _in_thread(executor: ThreadPoolExecutor, call: Callable[[], None]) -> None:

@@ -7,7 +7,7 @@ from threading import Event, Thread
 from typing import Any
 
 from fusiond.app.supervisor import keep_open
-from fusiond.config.schema import Config, sensor_tables
+from fusiond.config.schema import sensor_tables
 from fusiond.messages import InputHealth
 from fusiond.ports.inputs import LiveInput
 
@@ -59,12 +59,13 @@ class Inputs(Mapping[str, LiveInput[Any]]):
             if thread.ident is not None:
                 thread.join()
 
-    def configure(self, config: Config, keys: Sequence[str]) -> None:
-        """Use a new configuration, of which `keys` changed: the inputs concerned are opened again. Raises ConfigError."""
+    def adopt(self, fresh: Mapping[str, LiveInput[Any]], keys: Sequence[str]) -> None:
+        """Use the settings of inputs made with a new configuration, of which `keys` changed: the inputs concerned are opened
+        again. Cannot fail."""
         rates = any(key.partition(".")[0] in sensor_tables() for key in keys)
         for name, one in self._inputs.items():
             if any(key.startswith(f"{name}.") for key in keys) or (rates and name.startswith("mavlink.")):
-                one.configure(config)
+                one.adopt(fresh[name])
                 self._stops[name].set()
 
     def _keep(self, key: str) -> None:

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common
 from fusiond.config.toml import ConfigError
 from fusiond.ports.inputs import InputLost
 from fusiond_adapters.mavlink.decoder import message_id
-from tests.helpers.mavlink_peers import Endpoint, TcpPeer, UdpPeer, greeted, link_to, serving
+from tests.helpers.mavlink_peers import Endpoint, TcpPeer, UdpPeer, greeted, link_of, link_to, serving
 from tests.helpers.network import DEADLINE
 
 
@@ -59,10 +59,10 @@ def test_a_peer_that_is_missing_or_disconnects_is_a_lost_input(tmp_path: Path) -
     peer = TcpPeer()
     settings, link = link_to(peer, tmp_path)
     moved = msgspec.structs.replace(settings.mavlink["fc"], connection=f"tcp:127.0.0.1:{port}")
-    link.configure(msgspec.structs.replace(settings, mavlink={"fc": moved}))
+    link.adopt(link_of(msgspec.structs.replace(settings, mavlink={"fc": moved})))
     with pytest.raises(InputLost, match="cannot be opened: Connection refused"):
         link.session(Event())
-    link.configure(settings)
+    link.adopt(link_of(settings))
 
     def hang_up() -> None:
         peer.connected.close()  # accepted only now
@@ -81,5 +81,5 @@ def test_a_wrong_connection_is_a_fault_of_the_configuration(tmp_path: Path) -> N
     settings, link = link_to(peer, tmp_path)
     wrong = msgspec.structs.replace(settings.mavlink["fc"], connection="carrier:pigeon")
     with pytest.raises(ConfigError, match=r"mavlink\.fc\.connection: 'carrier:pigeon'"):
-        link.configure(msgspec.structs.replace(settings, mavlink={"fc": wrong}))
+        link_of(msgspec.structs.replace(settings, mavlink={"fc": wrong}))
     peer.close()

@@ -8,10 +8,11 @@ import random
 import socket
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from itertools import count
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
+from typing import Any
 
 import can
 import pytest
@@ -22,6 +23,7 @@ from pymavlink.dialects.v20 import common
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.config import load as config
 from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
 from fusiond.messages.codec import encode
 from fusiond.messages.types import StateMessage
 from fusiond_adapters.can.bus import CanBus
@@ -295,6 +297,82 @@ def test_reload(tmp_path: Path) -> None:
         with closing(peer):
             send(Autopilot().imu())
             run.until(lambda: link.inbox.received == 1)
+
+
+@contextmanager
+def service_manager(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], list[str]]]:
+    """What systemd is told: the lines of the next notification of a reload's end."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.settimeout(DEADLINE)
+        manager.bind(str(folder / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(folder / "notify"))
+
+        def after_reload() -> list[str]:
+            told = ""
+            while not told.startswith("RELOADING=1"):
+                told = manager.recv(4096).decode()
+            return manager.recv(4096).decode().splitlines()
+
+        yield after_reload
+
+
+def fails(fault: Exception) -> Callable[..., Any]:
+    """A function that raises."""
+
+    def call(*_: object, **__: object) -> None:
+        raise fault
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("what", "where", "fault", "reason"),
+    [
+        (config, "load", RecursionError("a deep one"), "failed: RecursionError('a deep one')"),
+        (config, "load", PermissionError(13, "Permission denied", "live.toml"), "Permission denied"),
+        (config, "load", ConfigError("two\nlines"), "two lines"),
+        (CanBus, "prepare", MemoryError(), "failed: MemoryError()"),
+        (Thread, "start", RuntimeError("can't start new thread"), "failed: RuntimeError"),
+        (None, "", None, "Not a directory"),
+    ],
+)
+def test_a_refused_reload_changes_nothing_and_the_daemon_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: Any, where: str, fault: Exception, reason: str
+) -> None:
+    """Whatever fails: the link, the black box and the configuration stay as they were, systemd hears why, SIGTERM works."""
+    first, second = free_port(), free_port()
+    settings = configuration(tmp_path, f"udpin:127.0.0.1:{first}", '[record]\nfolder = "box"\n')
+    file = tmp_path / "live.toml"
+    with service_manager(tmp_path, monkeypatch) as after_reload, running(settings, lambda: config.load(file)) as run:
+        link = run.daemon.inputs["mavlink.fc"]
+        run.until(lambda: run.daemon.up.is_set() and link.counts()["sessions"] == 1)
+        record, about = run.daemon.live.record, link.about
+        box = "elsewhere" if fault else "live.toml/box"
+        file.write_text(file.read_text().replace(str(first), str(second)).replace('"box"', f'"{box}"'))
+        with monkeypatch.context() as broken:
+            if fault:
+                broken.setattr(what, where, fails(fault))
+            run.call(run.daemon.reload)
+            ready, status = after_reload()
+        assert ready == "READY=1" and "; reload refused: " in status and reason in status
+        assert run.daemon.config == settings and run.daemon.live.record == record
+        assert (link.about, link.counts()["sessions"]) == (about, 1)
+        peer, send = udp(first)
+        with closing(peer):
+            send(Autopilot().imu())
+            run.until(lambda: link.inbox.received == 1)
+        file.write_text(file.read_text().replace(box, "elsewhere"))
+        run.call(run.daemon.reload)
+        ready, status = after_reload()
+        assert ready == "READY=1" and "refused" not in status
+        peer, send = udp(second)
+        with closing(peer):
+            run.until(lambda: link.counts()["sessions"] == 2)
+            send(Autopilot().imu())
+            run.until(lambda: link.inbox.received == 2)
+    assert [len(list((tmp_path / name).glob("*-fc.tlog"))) for name in ("box", "elsewhere")] == [1, 1]
+    outputs = run.daemon._io_health().outputs
+    assert (outputs["record"].offered, outputs["record"].dropped) == (2, 0)  # over both recordings
 
 
 def replayed(settings: Config, logs: list[str]) -> list[bytes]:
