@@ -9,7 +9,7 @@ from pathlib import Path
 from fusiond.config.schema import Config
 from fusiond.filter.hot_start import WORDS
 from fusiond.filter.state import Verdict
-from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, to_text
+from fusiond.filter.stored_state import DamagedStateError, StoredState, StoredStateError, check, from_text, to_text
 from fusiond.messages.types import OutputHealth
 
 MAX_BYTES = 1_000_000  # a larger file was not written by fusiond
@@ -27,7 +27,7 @@ def read_state(path: Path) -> StoredState | None:
     except OSError as error:
         raise StoredStateError(f"cannot be read: {error.strerror}") from error
     if len(text) > MAX_BYTES:
-        raise StoredStateError("torn or altered: it is too large")
+        raise DamagedStateError("torn or altered: it is too large")
     return from_text(text)
 
 
@@ -49,7 +49,17 @@ class StateFile:
                 self.stored = stored
         except StoredStateError as error:
             self._cold = str(error)
-            log.warning("stored state ignored: %s: %s", path, error)
+            kept = f"; kept as {self._set_aside()}" if isinstance(error, DamagedStateError) else ""
+            log.warning("stored state ignored: %s: %s%s", path, error, kept)
+
+    def _set_aside(self) -> Path:
+        """Rename the file, so that the next one does not replace it. Returns its path."""
+        aside = self._path.with_name(self._path.name + ".damaged")
+        try:
+            self._path.replace(aside)
+        except OSError:  # a disk that is read-only: it stays as it is, and is ignored again
+            return self._path
+        return aside
 
     def health(self, verdict: Verdict) -> OutputHealth:
         """Counts of writes and failures, and the verdict on the stored state, which is logged once when it is decided."""

@@ -78,15 +78,17 @@ def recall(state: FilterState, params: Parameters) -> tuple[StoredState | None, 
 
 def aged(stored: StoredState, state: FilterState, params: Parameters) -> tuple[list[float], list[float]]:
     """Values of gyro bias, accelerometer bias and calibrations, and their variances now: grown by the random walks, and
-    never larger than those of a cold start. What is frozen stays at zero."""
+    never larger than those of a cold start. What is frozen stays at zero; what was not estimated then starts cold."""
     age, noise = (int(state.stamps[T]) - stored.t_ns) * 1e-9, params.noise
     values = [*stored.gyro_bias, *stored.accel_bias, *stored.calibrations]
     kept = [*stored.gyro_bias_variance, *stored.accel_bias_variance, *stored.calibration_variances]
+    missing = [0.0] * (len(noise.calibrations) - len(stored.calibrations))
+    values, kept = values + missing, kept + [math.inf] * len(missing)
     walks = [noise.gyro_bias] * 3 + [noise.accel_bias] * 3 + list(noise.calibrations)
     cold = [square(params.imu.gyro_bias_sigma)] * 3 + [square(params.imu.accel_bias_sigma)] * 3
     cold += params.calibration_variances.tolist()
-    variances = [min(old + walk * age, most) for old, walk, most in zip(kept, walks, cold, strict=True)]
-    return [value if most > 0 else 0.0 for value, most in zip(values, cold, strict=True)], variances
+    variances = [min(old + walk * age, most) for old, walk, most in zip(kept, walks, cold, strict=False)]
+    return [value if most > 0 else 0.0 for value, most in zip(values, cold, strict=False)], variances
 
 
 def heading(

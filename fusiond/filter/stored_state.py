@@ -15,6 +15,7 @@ from fusiond.filter.state import (
     ACCEL_BIAS_B,
     ATTITUDE,
     CALIBRATIONS,
+    ERROR_SIZE,
     GNSS_ERROR,
     GYRO_BIAS,
     GYRO_BIAS_B,
@@ -23,6 +24,7 @@ from fusiond.filter.state import (
     POSITION_E,
     QUATERNION_EB,
     T_STILL,
+    WIDE_SIZE,
     FilterState,
     T,
 )
@@ -31,12 +33,18 @@ from fusiond.maths.wgs84 import geodetic, mat_ne
 
 VERSION = 2
 Variance = Annotated[float, Meta(ge=0, le=1e12)]
-Three = tuple[float, float, float]
+Angle = Annotated[float, Meta(ge=-4, le=4)]  # rad
+Bias = Annotated[float, Meta(ge=-100, le=100)]  # rad/s, m/s^2
+ThreeBiases = tuple[Bias, Bias, Bias]
 ThreeVariances = tuple[Variance, Variance, Variance]
 
 
 class StoredStateError(Exception):
     """What is stored cannot be used; the message says why."""
+
+
+class DamagedStateError(StoredStateError):
+    """No run has written it as it is: it is torn or altered."""
 
 
 class StoredState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -48,18 +56,18 @@ class StoredState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     t_ns: int
     at_rest: bool
     latitude: Annotated[float, Meta(ge=-2, le=2)]  # of the IMU
-    longitude: Annotated[float, Meta(ge=-4, le=4)]
-    height: float
+    longitude: Angle
+    height: Annotated[float, Meta(ge=-1e6, le=1e6)]
     position_variance: Variance  # horizontal, per axis
-    roll: float
-    pitch: float
-    yaw: float
+    roll: Angle
+    pitch: Angle
+    yaw: Angle
     yaw_variance: Variance
-    gyro_bias: Three
+    gyro_bias: ThreeBiases
     gyro_bias_variance: ThreeVariances
-    accel_bias: Three
+    accel_bias: ThreeBiases
     accel_bias_variance: ThreeVariances
-    calibrations: list[float]  # nominal values of the error states from CALIBRATIONS on
+    calibrations: list[Annotated[float, Meta(ge=-1e6, le=1e6)]]  # values of the error states from CALIBRATIONS on
     calibration_variances: list[Variance]
     checksum: int = 0  # CRC-32 of all the rest
 
@@ -111,16 +119,19 @@ def to_text(stored: StoredState) -> bytes:
 
 
 def from_text(text: bytes) -> StoredState:
-    """Read what `to_text` made. Raises StoredStateError."""
+    """Read what `to_text` made. Raises StoredStateError; DamagedStateError where it is damaged."""
     try:
         version = msgspec.json.decode(text, type=_Versioned).version
         if version != VERSION:
             raise StoredStateError(f"its version is {version}, not {VERSION}")
         stored = msgspec.json.decode(text, type=StoredState)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise StoredStateError(f"torn or altered: {error}") from error
+        raise DamagedStateError(f"torn or altered: {error}") from error
     if stored.checksum != _checksum(stored):
-        raise StoredStateError("torn or altered: its checksum is wrong")
+        raise DamagedStateError("torn or altered: its checksum is wrong")
+    sizes = len(stored.calibrations), len(stored.calibration_variances)
+    if sizes[0] != sizes[1] or sizes[0] not in (ERROR_SIZE - CALIBRATIONS, WIDE_SIZE - CALIBRATIONS):
+        raise DamagedStateError(f"torn or altered: it has {sizes[0]} calibrations and {sizes[1]} variances of them")
     return stored
 
 

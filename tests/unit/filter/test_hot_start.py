@@ -262,6 +262,26 @@ def test_a_frozen_calibration_stays_at_zero() -> None:
     assert (values[6], variances[6]) == (0.0, 0.0)
 
 
+def test_a_state_of_fewer_or_more_calibrations_is_of_use_for_those_that_there_are() -> None:
+    """Between two runs `wheel_scale_sigma` became 0, or was given, where each wheel has a scale."""
+    narrow, wide = config(), config(filter={"wheel_scale_by": "wheel"})
+    layouts = [make_parameters(setup, None) for setup in (narrow, wide)]
+    sizes = [len(layout.calibration_variances) for layout in layouts]
+    assert len(stored().calibrations) == sizes[0] < sizes[1]
+    state = FilterState(len(layouts[0].sources))
+    state.stamps[T] = stored().t_ns
+    values, variances = aged(stored(), state, layouts[1])
+    assert values == [*stored().gyro_bias, *stored().accel_bias, *stored().calibrations, *[0.0] * (sizes[1] - sizes[0])]
+    assert variances[6 + sizes[0] :] == layouts[1].calibration_variances[sizes[0] :].tolist()  # those of a cold start
+    more = [0.0] * (sizes[1] - sizes[0])
+    longer = msgspec.structs.replace(
+        stored(),
+        calibrations=[*stored().calibrations, *more],
+        calibration_variances=[*stored().calibration_variances, *more],
+    )
+    assert aged(longer, state, layouts[0]) == aged(stored(), state, layouts[0])
+
+
 def test_a_gyro_that_has_changed_contradicts_what_is_stored() -> None:
     changed = msgspec.structs.replace(stored(), gyro_bias=(0.2, 0.0, 0.0), gyro_bias_variance=(1e-8, 1e-8, 1e-8))
     hypothesis = hot(later(seconds=2.5)[1], changed).history.head.hypothesis(STORED)
