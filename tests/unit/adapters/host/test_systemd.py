@@ -15,7 +15,7 @@ from tests.helpers.paths import ROOT
 
 SYSTEMD = ROOT / "systemd"
 UNITS = ("fusiond.service", "fusiond@.service")
-EXPOSURE = 2.0  # the most that systemd may find
+EXPOSURE = 1.9  # the most that systemd may find
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
 
 
@@ -58,14 +58,22 @@ def test_the_watchdog_and_the_exit_codes_agree_with_the_daemon() -> None:
         assert f"\n{line}\n" in text
 
 
+def test_a_fault_in_it_cannot_take_the_whole_machine() -> None:
+    text = (SYSTEMD / UNITS[0]).read_text()
+    for line in ("MemoryMax=512M", "TasksMax=256", "LimitNOFILE=1024"):
+        assert f"\n{line}\n" in text
+
+
 def test_notifications(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.settimeout(10)
         manager.bind(str(tmp_path / "notify"))
         notifier = Notifier(str(tmp_path / "notify"))
         notifier.ready("well")
+        notifier.ready("refused: a text\nof two lines")
         notifier.reloading()
         assert manager.recv(100) == b"READY=1\nSTATUS=well"
+        assert manager.recv(100) == b"READY=1\nSTATUS=refused: a text of two lines"
         assert manager.recv(100).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
     notifier.stopping()
     assert notifier.lost == 1
