@@ -25,7 +25,7 @@ OUTPUTS: Mapping[str, Callable[[Config], bool]] = {  # module: whether the confi
     "ros2.output": lambda config: config.ros2.enabled,
     "mcap": lambda config: config.mcap.folder is not None,
     "foxglove.server": lambda config: config.foxglove.enabled,
-    "prometheus": lambda config: config.prometheus.enabled,
+    "prometheus.server": lambda config: config.prometheus.enabled,
     "mavlink.outputs": lambda config: _mavlink_outputs(config) != {None},
 }
 LOG_FORMATS = (

@@ -17,6 +17,6 @@ fi
 install -Dm644 -t "$root/usr/lib/systemd/system" systemd/fusiond.service systemd/fusiond@.service
 install -Dm644 systemd/fusiond.sysusers "$root/usr/lib/sysusers.d/fusiond.conf"
 install -Dm644 systemd/fusiond.tmpfiles "$root/usr/lib/tmpfiles.d/fusiond.conf"
-install -Dm644 -t "$root/usr/share/fusiond/examples" configs/*.toml configs/*.dbc systemd/80-can0.network
+install -Dm644 -t "$root/usr/share/fusiond/examples" configs/*.toml configs/*.dbc configs/prometheus/* systemd/80-can0.network
 install -dm755 "$root/usr/bin"
 ln -sfn /opt/fusiond/bin/fusiond "$root/usr/bin/fusiond"

@@ -16,10 +16,12 @@ class RecentLatencies:
 
     def __init__(self, kept: int = KEPT) -> None:
         self.count = 0  # number of all latencies so far
+        self._sum_ns = 0  # and their sum
         self._ring: NDArray[np.int64] = np.zeros(kept, dtype=np.int64)
 
     def add(self, latency_ns: int) -> None:
         self._ring[self.count % len(self._ring)] = latency_ns
+        self._sum_ns += latency_ns
         self.count += 1
 
     def report(self) -> Quantiles | None:
@@ -28,4 +30,5 @@ class RecentLatencies:
         if not len(kept):
             return None
         p50, p90, p99 = (float(kept[round(share * (len(kept) - 1))]) / MILLISECOND for share in (0.5, 0.9, 0.99))
-        return Quantiles(p50=p50, p90=p90, p99=p99, max=float(kept[-1]) / MILLISECOND)
+        most, total = float(kept[-1]) / MILLISECOND, self._sum_ns / MILLISECOND
+        return Quantiles(p50=p50, p90=p90, p99=p99, max=most, count=self.count, sum=total)

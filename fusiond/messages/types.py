@@ -134,12 +134,14 @@ class EventMessage(Message, frozen=True, kw_only=True):
 
 
 class Quantiles(Message, frozen=True, kw_only=True):
-    """Quantiles of the latest few thousand latencies."""
+    """Quantiles of the latest few thousand latencies; number and sum of all so far."""
 
     p50: Annotated[float, _about("median [ms]")]
     p90: Annotated[float, _about("90 % are below [ms]")]
     p99: Annotated[float, _about("99 % are below [ms]")]
     max: Annotated[float, _about("largest [ms]")]
+    count: Annotated[int, _about("number of all so far")]
+    sum: Annotated[float, _about("their sum [ms]")]
 
 
 class LatencyHealth(Message, frozen=True, kw_only=True):

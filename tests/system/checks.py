@@ -164,8 +164,7 @@ def limited(bench: Bench) -> str:
     found = {name: bench.show(name) for name in LIMITS}
     if found != LIMITS:
         raise Failed(f"limits {found}")
-    files = len(os.listdir(f"/proc/{bench.pid}/fd"))
-    threads = len(os.listdir(f"/proc/{bench.pid}/task"))
+    files, threads = (len(list(Path(f"/proc/{bench.pid}/{name}").iterdir())) for name in ("fd", "task"))
     if max(4 * bench.rss_mb() / 512, 4 * threads / 256, 4 * files / 1024) > 1:
         raise Failed(f"over a quarter of a limit: {bench.rss_mb():.0f} MB, {threads} threads, {files} files")
     return f"{bench.rss_mb():.0f} MB of 512 MiB, {threads} threads of 256, {files} files of 1024"

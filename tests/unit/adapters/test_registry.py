@@ -69,10 +69,12 @@ def test_nothing_is_imported_for_what_is_off() -> None:
 
 
 @pytest.mark.parametrize(
-    ("adapter", "library"), [("mcap", "mcap"), ("foxglove.server", "foxglove"), ("prometheus", "prometheus_client")]
+    ("adapter", "library"), [("mcap", "mcap"), ("foxglove.server", "foxglove"), ("prometheus.server", "prometheus_client")]
 )
 def test_a_missing_extra_is_named(adapter: str, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, library, None)  # as if it were not installed
-    monkeypatch.delitem(sys.modules, f"fusiond_adapters.{adapter}", raising=False)
+    package = f"fusiond_adapters.{adapter.partition('.')[0]}"
+    for name in [name for name in sys.modules if name.startswith(package)]:
+        monkeypatch.delitem(sys.modules, name)
     with pytest.raises(ConfigError, match=rf"pip install 'fusiond\[{adapter.removesuffix('.server')}\]'"):
         importlib.import_module(f"fusiond_adapters.{adapter}")

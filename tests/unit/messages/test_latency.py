@@ -15,5 +15,6 @@ def test_quantiles_are_of_the_latest_in_milliseconds() -> None:
     latencies = RecentLatencies(kept=101)
     for latency in (900, *reversed(range(101))):
         latencies.add(latency * MILLISECOND)
-    assert latencies.report() == Quantiles(p50=50.0, p90=90.0, p99=99.0, max=100.0)
-    assert latencies.count == 102
+    assert latencies.report() == Quantiles(
+        p50=50.0, p90=90.0, p99=99.0, max=100.0, count=102, sum=900.0 + sum(range(101))
+    )

@@ -78,7 +78,7 @@ def test_a_peer_that_is_missing_or_disconnects_is_a_lost_input(tmp_path: Path) -
 
 def test_a_wrong_connection_is_a_fault_of_the_configuration(tmp_path: Path) -> None:
     peer = UdpPeer()
-    settings, link = link_to(peer, tmp_path)
+    settings, _ = link_to(peer, tmp_path)
     wrong = msgspec.structs.replace(settings.mavlink["fc"], connection="carrier:pigeon")
     with pytest.raises(ConfigError, match=r"mavlink\.fc\.connection: 'carrier:pigeon'"):
         link_of(msgspec.structs.replace(settings, mavlink={"fc": wrong}))
