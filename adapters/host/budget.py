@@ -16,13 +16,18 @@ SHARE = 0.05
 class Budget:
     """The budget of the thread that makes it. `worked_s` reads the processor time of that thread."""
 
-    def __init__(self, share: float = SHARE, worked_s: Callable[[], float] = time.thread_time) -> None:
+    def __init__(
+        self,
+        share: float = SHARE,
+        worked_s: Callable[[], float] = time.thread_time,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         self._rest_per_work = 1 / share - 1
-        self._worked_s = worked_s
+        self._worked_s, self._sleep = worked_s, sleep
         self._paid_s = worked_s()
 
-    def rest_s(self) -> float:
-        """How long the thread should sleep now, for its work since the last call [s]."""
+    def rest(self) -> None:
+        """Sleep for what the thread has worked since the last call, so that its share is kept."""
         now_s = self._worked_s()
         worked_s, self._paid_s = now_s - self._paid_s, now_s
-        return worked_s * self._rest_per_work
+        self._sleep(worked_s * self._rest_per_work)

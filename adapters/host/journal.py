@@ -134,3 +134,4 @@ def set_up(level: int = logging.INFO) -> None:
     handler.addFilter(Repeats())
     logging.basicConfig(level=level, handlers=[handler], force=True)
     logging.getLogger("can").setLevel(logging.CRITICAL)  # python-can logs a missing bus and raises it too
+    logging.getLogger("foxglove").setLevel(logging.WARNING)  # it logs the address that is hidden behind the gate

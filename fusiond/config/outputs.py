@@ -17,6 +17,7 @@ Namespace = Annotated[
         description="a slash, or names that each follow a slash, as /fleet/rover",
     ),
 ]
+SITES = ("https://app.foxglove.dev", "http://localhost:8080")  # Foxglove, and Lichtblick as its container serves it
 
 
 class Publish(Section, frozen=True, kw_only=True):
@@ -62,6 +63,7 @@ class Foxglove(Section, frozen=True, kw_only=True):
     enabled: bool = False  # serve
     host: str = "127.0.0.1"  # address to listen on; there is no access control
     port: Annotated[int, Meta(ge=0, le=65535)] = 8765  # TCP port; 0: any that is free
+    origins: list[str] = field(default_factory=lambda: list(SITES))  # web sites whose pages may connect; programs always may
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = 20.0  # states a second, at most
 
 

@@ -75,7 +75,7 @@ def test_a_client_gets_the_states_and_events() -> None:
     assert published_state == encode(sent[t_ns], "json")
     assert json.loads(got[LOG][1])["message"] == event.text
     assert json.loads(got[POSE][1])["frame_id"] == "local_enu"
-    assert server.url is None and server.counts()["records"] >= 5
+    assert server.url is None and server.counts()["records"] >= 5 and server.counts()["clients"] == 1
 
 
 def test_a_topic_that_it_does_not_have_is_counted() -> None:
@@ -116,6 +116,21 @@ def test_a_client_that_does_not_read_holds_up_nothing() -> None:
                 server.outbox.put(message)
             until(lambda: server.outbox.latency.count == server.outbox.offered - server.outbox.dropped)
     assert server.outbox.offered == rounds * len(states()) and server.outbox.dropped == 0
+
+
+def test_a_page_of_a_foreign_site_is_refused() -> None:
+    client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
+    from websockets.exceptions import InvalidStatus  # noqa: PLC0415
+
+    server = server_of()
+    with serving(server):
+        for origin in ("https://evil.example", "null", "http://127.0.0.1:8765"):
+            with pytest.raises(InvalidStatus, match="HTTP 403"):
+                client.connect(server.url, subprotocols=["foxglove.sdk.v1"], origin=origin, open_timeout=DEADLINE)
+        for origin in (None, "https://app.foxglove.dev", "file://"):
+            with client.connect(server.url, subprotocols=["foxglove.sdk.v1"], origin=origin, open_timeout=DEADLINE) as peer:
+                assert json.loads(peer.recv(DEADLINE))["name"] == "fusiond tested"
+        assert (server.counts()["clients"], server.counts()["refused"]) == (3, 3)
 
 
 def until(condition: Callable[[], bool]) -> None:
