@@ -29,6 +29,7 @@ PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TI
 KEPT = {"health": 4, "events": 64, "info": 1, "config": 1}  # samples kept for readers that missed them
 RETRY = {"period_init_ms": 100, "period_max_ms": 100, "period_increase_factor": 1}  # of connecting; Zenoh's own is 1 to 4 s
 QUEUED = 16  # samples in the queue of a priority; Zenoh's default of 2 loses the rest of a burst
+SESSIONS = 64  # peers at once: each subscriber adds 3 us to a state; Zenoh's default of 1000 would delay it by 3 ms
 PATIENCE_US = 1000  # how long a sample waits for room in the queue; Zenoh's default
 LAST_SAMPLE_S = 1.0  # within this time a reader learns that it missed the last sample
 WAIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
@@ -81,6 +82,7 @@ def session_config(section: ZenohSection, directory: str | Path = ".", *, patien
         ("scouting/multicast/enabled", section.multicast_scouting, default.multicast_scouting),
         ("scouting/gossip/enabled", False, False),
         ("connect/retry", RETRY, RETRY),
+        ("transport/unicast/max_sessions", SESSIONS, SESSIONS),
         ("transport/link/tx/queue/size/real_time", QUEUED, QUEUED),
         ("transport/link/tx/queue/size/data", QUEUED, QUEUED),
         (WAIT, PATIENCE_US if patient else 0, PATIENCE_US),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -153,3 +154,14 @@ def test_it_stops_at_once_with_clients_connected() -> None:
         began = time.monotonic()
         server.stop()
         assert time.monotonic() - began < http.TIMEOUT_S / 2
+
+
+def test_who_scrapes_without_end_gets_a_twentieth_of_the_time() -> None:
+    with serving() as server:
+        (thread,) = (one for one in threading.enumerate() if one.name == "http")
+        clock = time.pthread_getcpuclockid(thread.ident or 0)
+        began, worked = time.monotonic(), time.clock_gettime(clock)
+        for _ in range(40):
+            assert said(server, b"GET /metrics HTTP/1.1\r\n\r\n")[1] == b"one two\n"
+        took, worked = time.monotonic() - began, time.clock_gettime(clock) - worked
+    assert worked < 0.06 * took + 0.002

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import pytest
 
 from fusiond.app.client import Client, ClientError
@@ -62,3 +65,20 @@ def test_one_query_for_everything() -> None:
         found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
         assert found == {"fusiond/rover/info", "fusiond/rover/innovations/left", "fusiond/rover/events"}
         assert client.latest(InnovationMessage) == innovation
+
+
+def test_who_asks_without_end_is_answered_within_the_budget() -> None:
+    """2000 queries at once: some get replies, all end, and the answers took a twentieth of the time."""
+    where, published = endpoint(), states(3)
+    with publishing(settings(where), *published) as output, Client(where, "rover") as client:
+        output.outbox.put(event("done"))
+        next(client.stream(EventMessage, DEADLINE))
+        (thread,) = (one for one in threading.enumerate() if one.name == "zenoh answers")
+        clock = time.pthread_getcpuclockid(thread.ident or 0)
+        began, worked = time.monotonic(), time.clock_gettime(clock)
+        asked = [client._session.get("fusiond/rover/**", timeout=DEADLINE) for _ in range(2000)]
+        replied = sum(1 for replies in asked if any(reply.ok for reply in replies))
+        took, worked = time.monotonic() - began, time.clock_gettime(clock) - worked
+        assert client.state_at(published[-1].t_ns) == published[-1]
+    assert 0 < replied < 2000
+    assert worked < 0.1 * took + 0.01

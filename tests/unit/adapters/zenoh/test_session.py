@@ -129,6 +129,7 @@ def test_by_default_only_loopback_is_used_and_nothing_scouts() -> None:
     assert config.get_json("scouting/multicast/enabled") == "false"
     assert config.get_json("scouting/gossip/enabled") == "false"
     assert json.loads(config.get_json("mode")) == "peer"
+    assert json.loads(config.get_json("transport/unicast/max_sessions")) == 64
 
 
 def test_a_burst_waits_and_an_impatient_publisher_does_not(tmp_path: Path) -> None:
