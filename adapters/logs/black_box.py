@@ -138,8 +138,8 @@ class Recorder:
             self.written += file.sync()
         except OSError as error:
             self.error = error.strerror or str(error)
-            self._lost += file.unsynced
-        file.close()
+        self.written += file.close()
+        self._lost += file.unsynced
 
     def __enter__(self) -> Recorder:
         return self
@@ -156,10 +156,16 @@ class _File:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = 0  # with the records that are not written yet [bytes]
-        self.unsynced = 0  # records that a power failure would take
-        self._synced_size = 0
+        self._lengths: list[int] = []  # of the records that a power failure would take
+        self._written_size = self._synced_size = 0
         self._gathered = bytearray()
+        self._can_sync = True  # after an error the kernel forgets what it could not write
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+
+    @property
+    def unsynced(self) -> int:
+        """Number of records that are not on the disk."""
+        return len(self._lengths)
 
     @property
     def gathered(self) -> int:
@@ -170,31 +176,53 @@ class _File:
         """Gather a record."""
         self._gathered += record
         self.size += len(record)
-        self.unsynced += 1
+        self._lengths.append(len(record))
 
     def write(self) -> None:
         """Write what was gathered, without syncing it."""
         while self._gathered:
-            del self._gathered[: os.write(self._file, self._gathered)]
+            size = os.write(self._file, self._gathered)
+            del self._gathered[:size]
+            self._written_size += size
 
     def sync(self) -> int:
         """Write, and sync to the disk. Returns the number of records that have come onto the disk by this."""
-        if not self.unsynced:
+        if not self._lengths:
             return 0
         self.write()
-        os.fdatasync(self._file)
-        if not self._synced_size:
-            sync_folder(self.path.parent)  # so that the name survives a power failure
-        self._synced_size = self.size
-        synced, self.unsynced = self.unsynced, 0
-        return synced
+        return self._sync(len(self._lengths), self.size)
 
-    def close(self) -> None:
-        """Close it, without the records that could not be synced; without any the file is removed."""
-        with suppress(OSError):  # those records are lost either way
-            os.ftruncate(self._file, self._synced_size)
+    def _sync(self, records: int, size: int) -> int:
+        try:
+            os.fdatasync(self._file)
+            if not self._synced_size:
+                sync_folder(self.path.parent)  # so that the name survives a power failure
+        except OSError:
+            self._can_sync = False
+            raise
+        self._synced_size = size
+        del self._lengths[:records]
+        return records
+
+    def close(self) -> int:
+        """Close it, after an error with the whole records that fit on the disk; without any the file is removed. Returns the
+        number of records that have come onto the disk by this."""
+        kept = 0
+        with suppress(OSError):  # what is not synced then is lost
+            kept = self._keep_what_fits()
         with suppress(OSError):
             os.close(self._file)
         if not self._synced_size:
             with suppress(OSError):
                 self.path.unlink()
+        return kept
+
+    def _keep_what_fits(self) -> int:
+        records, size = 0, self._synced_size
+        if self._can_sync:
+            for length in self._lengths:
+                if size + length > self._written_size:
+                    break
+                records, size = records + 1, size + length
+        os.ftruncate(self._file, size)
+        return self._sync(records, size) if records else 0
