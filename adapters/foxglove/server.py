@@ -54,10 +54,10 @@ class FoxgloveServer:
             raise OutputLost(f"{self.about}: {error}") from error
         try:
             gate = Gate(section.host, section.port, (inside, server.port), section.origins)
-        except OSError as error:
+            gate.start()
+        except (OSError, RuntimeError) as error:
             server.stop()
-            raise OutputLost(f"{self.about}: {error.strerror}") from error
-        gate.start()
+            raise OutputLost(f"{self.about}: {getattr(error, 'strerror', None) or error}") from error
         self._gate = gate
         try:
             host = f"[{section.host}]" if ":" in section.host else section.host

@@ -34,9 +34,9 @@ class PrometheusServer:
         host = self._section.host
         try:
             server = HttpServer(host, self._section.port, PATH, self._page.text)
-        except OSError as error:
-            raise OutputLost(f"{self.about}: {error.strerror}") from error
-        server.start()
+            server.start()
+        except (OSError, RuntimeError) as error:
+            raise OutputLost(f"{self.about}: {getattr(error, 'strerror', None) or error}") from error
         self._server = server
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{server.port}{PATH}"
         try:
