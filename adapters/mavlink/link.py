@@ -97,8 +97,9 @@ class MavlinkLink:
             while not stop.is_set():
                 self._receive(transport, splitter)
                 self.skipped_bytes = skipped_before + splitter.skipped_bytes
-                self._counts = counts_before + Counter(transport.counts)
-                self.inbox.missed = self._counts[IN_KERNEL]
+                counts = Counter(counts_before)
+                counts.update(transport.counts)
+                self._counts, self.inbox.missed = counts, counts[IN_KERNEL]
                 while self.housekeeping.changes:
                     log.info("%s: %s", self.about, self.housekeeping.changes.pop(0))
                 with self._sending:

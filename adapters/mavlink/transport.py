@@ -20,6 +20,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from threading import Lock
 from typing import Protocol
 
@@ -272,21 +273,18 @@ class _TcpIn:
     def read(self, timeout_s: float) -> list[tuple[bytes, Peer]]:
         peer, self.more = self._peer, False
         ready = _wait([self._listener, *([peer.socket] if peer else [])], timeout_s)
+        if peer is not None and peer.socket in ready:  # before a newcomer is looked at: it may have closed
+            try:
+                found: list[tuple[bytes, Peer]] = [(data, self._number) for data, _ in peer.read(0)]
+                self.more = peer.more
+                return found
+            except (OSError, EOFError):
+                self._follow(None)
         if self._listener in ready:
             self.more = True  # whoever connects in a loop does so at most once in a pause
-            try:
+            with suppress(BlockingIOError, ConnectionAbortedError):  # it has gone again
                 self._welcome(self._listener.accept()[0])
-            except (BlockingIOError, ConnectionAbortedError):
-                pass  # it has gone again
-        if peer is None or peer is not self._peer or peer.socket not in ready:
-            return []
-        try:
-            found = [(data, self._number) for data, _ in peer.read(0)]
-        except (OSError, EOFError):
-            self._follow(None)
-            return []
-        self.more |= peer.more
-        return found
+        return []
 
     def heard(self, peer: Peer) -> None:
         self._heard_s = time.monotonic()
