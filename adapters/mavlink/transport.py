@@ -36,6 +36,7 @@ CONNECT_TIMEOUT_S = 5.0
 FORGET_S = 60.0  # a UDP peer that sends no valid frame for this long gets no more replies
 SILENT_S = 3.0  # a TCP client that sends no valid frame for this long yields to the next; heartbeats come each second
 MAX_PEERS = 16
+BACKLOG = 16  # TCP clients that wait to be turned away; if it were full, the true one could not come back
 
 Peer = Hashable  # an address, or the number of a TCP client
 IN_KERNEL, TURNED_AWAY = "lost in the kernel's queue", "clients turned away"
@@ -261,7 +262,7 @@ class _TcpIn:
     datagrams = False
 
     def __init__(self, address: tuple[str, int]) -> None:
-        self._listener = socket.create_server(address, backlog=1)
+        self._listener = socket.create_server(address, backlog=BACKLOG)
         self._listener.setblocking(False)
         self.more = False
         self.counts = {TURNED_AWAY: 0}
