@@ -41,6 +41,7 @@ from benchmarks.latency import (
     WARM_UP,
     Reading,
     configuration,
+    every,
     free_port,
     process,
     quantiles,
@@ -54,6 +55,7 @@ from fusiond.app.live.serve import serve
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
+from fusiond_adapters.mavlink.signing import EPOCH_NS, TICK_NS
 
 TICK_S = 0.005  # between two looks at what is due
 PORTS = 40  # of the strangers
@@ -78,6 +80,7 @@ ATTACKS = {
     "mutated": Attack(200, "the autopilot's own frames, cut off or with a bit flipped"),
     "noise": Attack(200, "random bytes, up to 300"),
     "strangers": Attack(200, f"valid frames of other systems, from {PORTS} ports, that want the replies"),
+    "forged": Attack(100, "to a link with signing: frames unsigned, signed with another key, or played back"),
     "tiny": Attack(20_000, "datagrams of one byte: more than the daemon reads"),
     "thief": Attack(2, "attempts to open the port as well, with SO_REUSEADDR"),
     "clients": Attack(20, "TCP clients that connect beside the first one"),
@@ -87,6 +90,8 @@ ATTACKS = {
     "stopped": Attack(0, "a Zenoh subscriber that is stopped (SIGSTOP) for the whole run"),
     "reloads": Attack(0.2, "reloads of a configuration that is refused"),
 }
+KEY = bytes(range(32))
+HEARTBEAT_HZ = 10
 DATAGRAMS = ("0xFE", "beginnings", "unknown", "mutated", "noise", "strangers", "tiny")
 HELD = 400  # connections that an attacker keeps open
 MOST_AT_ONCE = 200  # times that an attack is made at once, after the attackers' process had to wait
@@ -101,7 +106,8 @@ class Ports(msgspec.Struct):
     tcp: int
     prometheus: int
     foxglove: int
-    slcan: str = ""  # the attacker's end of the line is a file descriptor of this process, see `garble`
+    signed: int  # UDP, a link with signing
+    recorded: str = ""  # a frame that was sent to it, in hexadecimal digits
 
 
 class Account(NamedTuple):
@@ -136,6 +142,21 @@ class Result(NamedTuple):
         return not self.notes and all(account.difference == 0 for account in self.accounts)
 
 
+def heartbeat(link: common.MAVLink, kind: int = common.MAV_TYPE_GROUND_ROVER, maker: int = 3) -> bytes:
+    """The next frame of a sender."""
+    packed = bytes(common.MAVLink_heartbeat_message(kind, maker, 0, 0, 0, 3).pack(link))
+    link.seq = (link.seq + 1) & 0xFF
+    return packed
+
+
+def signing(key: bytes) -> common.MAVLink:
+    """A sender that signs."""
+    made = common.MAVLink(None, srcSystem=1, srcComponent=1)
+    made.signing.secret_key, made.signing.sign_outgoing = key, True
+    made.signing.timestamp = (time.time_ns() - EPOCH_NS) // TICK_NS
+    return made
+
+
 # --- The attackers
 
 
@@ -150,6 +171,7 @@ class Attackers:
         self._sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(PORTS)]
         self._frames = [one for data in sent_by_autopilot(time.monotonic_ns(), 2.0) for one in data]
         self._held: list[socket.socket] = []
+        self._signing = signing(b"another key".ljust(32))
         self._links = [common.MAVLink(None, srcSystem=2 + number, srcComponent=1) for number in range(PORTS)]
 
     def attack(self, name: str) -> None:
@@ -166,30 +188,25 @@ class Attackers:
 
     def _send(self, name: str) -> None:
         place = self.sent[name] % PORTS if name == "strangers" else 0
-        self._sockets[place].sendto(self._datagram(name, place), ("127.0.0.1", self._ports.udp))
+        port = self._ports.signed if name == "forged" else self._ports.udp
+        self._sockets[place].sendto(self._datagram(name, place), ("127.0.0.1", port))
 
     def _datagram(self, name: str, place: int) -> bytes:
-        noise = self._noise
-        if name == "0xFE":
-            return b"\xfe" * 1400
-        if name == "tiny":
-            return b"\xfd"
-        if name == "noise":
-            return noise.randbytes(noise.randrange(1, 300))
+        if name in ("beginnings", "unknown"):
+            head = bytes((0xFD, 255, 0, 0, self._noise.randrange(256), 1, 1, 0xFF, 0xFF, 0xFF))
+            return head if name == "beginnings" else head + self._noise.randbytes(257)
+        if name == "mutated":
+            frame = bytearray(self._noise.choice(self._frames))
+            frame[self._noise.randrange(len(frame))] ^= 1 << self._noise.randrange(8)
+            return bytes(frame[: self._noise.randrange(1, len(frame) + 1)])
+        if name == "forged":
+            return (self._heartbeat(), heartbeat(self._signing), bytes.fromhex(self._ports.recorded))[self.sent[name] % 3]
         if name == "strangers":
             return self._heartbeat(place)
-        if name == "mutated":
-            frame = bytearray(noise.choice(self._frames))
-            frame[noise.randrange(len(frame))] ^= 1 << noise.randrange(8)
-            return bytes(frame[: noise.randrange(1, len(frame) + 1)])
-        head = bytes((0xFD, 255, 0, 0, noise.randrange(256), 1, 1, 0xFF, 0xFF, 0xFF))
-        return head if name == "beginnings" else head + noise.randbytes(257)
+        return {"0xFE": b"\xfe" * 1400, "tiny": b"\xfd"}.get(name) or self._noise.randbytes(self._noise.randrange(1, 300))
 
     def _heartbeat(self, place: int = 0) -> bytes:
-        link = self._links[place]
-        packed = bytes(common.MAVLink_heartbeat_message(common.MAV_TYPE_GCS, 8, 0, 0, 0, 3).pack(link))
-        link.seq = (link.seq + 1) & 0xFF
-        return packed
+        return heartbeat(self._links[place], common.MAV_TYPE_GCS, 8)
 
     def _steal(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
@@ -295,6 +312,11 @@ def settings(folder: Path, ports: Ports, attacks: Collection[str], slcan: str) -
         more += f"[prometheus]\nenabled = true\nport = {ports.prometheus}\n"
     if "viewers" in attacks:
         more += f"[foxglove]\nenabled = true\nport = {ports.foxglove}\n"
+    if "forged" in attacks:
+        (folder / "key").write_bytes(KEY)
+        (folder / "key").chmod(0o600)
+        more += f'[mavlink.signed]\nconnection = "udpin:127.0.0.1:{ports.signed}"\nsigning_key_file = "key"\n'
+        more += 'signing_timestamp_file = "timestamp"\n'
     file.write_text(file.read_text() + more + '[state]\nfile = "state.json"\n')
     return config.load(file)
 
@@ -309,20 +331,34 @@ class Client:
         self._link = common.MAVLink(None, srcSystem=1, srcComponent=1)
 
     def play(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            packed = common.MAVLink_heartbeat_message(common.MAV_TYPE_GROUND_ROVER, 3, 0, 0, 0, 3).pack(self._link)
-            self._link.seq = (self._link.seq + 1) & 0xFF
+        """In a thread."""
+        for _ in every(HEARTBEAT_HZ, seconds):
+            packed = heartbeat(self._link)
             try:
-                self.sent += self._socket.send(bytes(packed)) == len(packed)
+                self.sent += self._socket.send(packed) == len(packed)
                 with suppress(BlockingIOError):
                     self.lost += self._socket.recv(65536) == b""
             except OSError:
                 self.lost += 1
-            time.sleep(0.1)
 
     def close(self) -> None:
         self._socket.close()
+
+
+class Signer:
+    """The autopilot of the link with signing: a heartbeat ten times a second."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+        self._link = signing(KEY)
+        self.first = heartbeat(self._link)
+
+    def play(self, port: int, seconds: float) -> None:
+        """In a thread."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+            for number in every(HEARTBEAT_HZ, seconds):
+                peer.sendto(heartbeat(self._link) if number else self.first, ("127.0.0.1", port))
+                self.sent += 1
 
 
 class Arena:
@@ -331,7 +367,8 @@ class Arena:
     def __init__(self, folder: Path, seconds: float, attacks: Collection[str], seed: int) -> None:
         self.attacks, self.seconds, self.seed = attacks, seconds, seed
         tcp = [free_port(socket.SOCK_STREAM) for _ in range(4)]
-        self.ports = Ports(free_port(socket.SOCK_DGRAM), *tcp)
+        self.signer = Signer()
+        self.ports = Ports(free_port(socket.SOCK_DGRAM), *tcp, free_port(socket.SOCK_DGRAM), self.signer.first.hex())
         self.slcan = Slcan(seed) if "slcan" in attacks else None
         made = settings(folder, self.ports, attacks, self.slcan.channel if self.slcan else "")
         self.daemon = Daemon(made, _refused)
@@ -348,6 +385,9 @@ class Arena:
             threading.Thread(target=turn_wheels, args=(self.whole_s,), name="(the benchmark's wheels)"),
             threading.Thread(target=self.client.play, args=(self.whole_s,), name="(the benchmark's TCP client)"),
         ]
+        if "forged" in self.attacks:
+            given = (self.ports.signed, self.whole_s)
+            self.threads.append(threading.Thread(target=self.signer.play, args=given, name="(the benchmark's signer)"))
         for thread in self.threads:
             thread.start()
         if "stopped" in self.attacks:
@@ -405,6 +445,11 @@ class Arena:
             if name == "mavlink.fc":
                 read = {"read": counts["datagrams"], "lost in the kernel": counts["lost in the kernel's queue"]}
                 found.append(Account("datagrams", datagrams, read))
+            elif name == "mavlink.signed":
+                read = {"read": counts["datagrams"], "lost in the kernel": counts["lost in the kernel's queue"]}
+                found.append(Account("datagrams of the signed link", self.signer.sent + sent["forged"], read))
+                refused = {kind: counts[kind] for kind in ("unsigned", "wrongly signed")}
+                found.append(Account("frames there", counts["datagrams"], {"passed on": inbox.received} | refused))
             elif name == "mavlink.spare":
                 found.append(Account("frames of the first TCP client", self.client.sent, {"received": inbox.received}))
             elif name == "can.aux" and self.slcan is not None:
@@ -457,16 +502,18 @@ def report(result: Result) -> str:
     return "\n".join([*lines, *map(str, result.accounts), *(f"WRONG: {note}" for note in result.notes)])
 
 
+def _off(account: Account) -> int:
+    return abs(account.difference)
+
+
 def row(name: str, result: Result) -> str:
     """A row of the table in docs/reliability.md."""
-    whole = Account("", sum(each.received for each in result.accounts), {
-        "": sum(sum(each.outcomes.values()) for each in result.accounts),
-    })  # fmt: skip
+    received = sum(each.received for each in result.accounts)
     lost = sum(count for each in result.accounts for kind, count in each.outcomes.items() if kind in LOSSES)
-    about = ATTACKS[name].about if name in ATTACKS else "no attack"
-    tried = result.sent.get(name, 0)
-    outcomes = sum(whole.outcomes.values()) - lost
-    return f"| {about} | {tried} | {whole.received} | {outcomes} | {lost} | {whole.difference} | {result.p99_ms():.1f} |"
+    outcomes = sum(sum(each.outcomes.values()) for each in result.accounts) - lost
+    about = ATTACKS[name].about if name in ATTACKS else "all of these at once" if name == "all" else "no attack"
+    tried = result.sent[name] if name in result.sent else sum(result.sent.values())
+    return f"| {about} | {tried:,} | {received:,} | {outcomes:,} | {lost:,} | {sum(map(_off, result.accounts))} |"
 
 
 def as_installed() -> None:
@@ -475,9 +522,9 @@ def as_installed() -> None:
     set_timer_slack(TIMER_SLACK_NS)
 
 
-LOSSES = ("lost in the kernel", "thinned", "garbled")
-HEAD = """| attack | tried | received | outcomes | counted losses | difference | state p99 [ms] |
-|---|---|---|---|---|---|---|"""
+LOSSES = ("lost in the kernel", "thinned", "garbled", "unsigned", "wrongly signed")
+HEAD = """| scenario | tried | received | outcomes | counted losses | difference |
+|---|---|---|---|---|---|"""
 
 
 def main(arguments: list[str]) -> int:

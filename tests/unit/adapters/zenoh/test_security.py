@@ -150,7 +150,7 @@ def test_a_router_of_another_authority_is_not_trusted(samples: Path, endpoint: s
 
 @pytest.mark.parametrize("file", [None, SAMPLES / "read-only.json5"])
 @pytest.mark.parametrize("mode", ["client", "peer"])
-def test_whoever_connects_can_publish_unless_the_sample_forbids_it(file: Path | None, mode: Literal["client", "peer"]) -> None:
+def test_a_process_that_connects_can_publish_unless_forbidden(file: Path | None, mode: Literal["client", "peer"]) -> None:
     """A reader and a forger, both connected to fusiond; no certificates."""
     where, came, heard = free_endpoint(), Event(), list[str]()
     config = settings(where)
