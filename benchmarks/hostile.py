@@ -57,6 +57,7 @@ from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond_adapters.mavlink.signing import EPOCH_NS, TICK_NS
 
+BEGIN_NS = 10**12  # the autopilot's clock in the frames that are mutated
 TICK_S = 0.005  # between two looks at what is due
 PORTS = 40  # of the strangers
 SETTLE_S = 0.5  # after the last datagram
@@ -169,7 +170,7 @@ class Attackers:
         self._ports, self._stack = ports, stack
         self._noise = random.Random(seed)
         self._sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(PORTS)]
-        self._frames = [one for data in sent_by_autopilot(time.monotonic_ns(), 2.0) for one in data]
+        self._frames = [one for data in sent_by_autopilot(BEGIN_NS, 2.0) for one in data]
         self._held: list[socket.socket] = []
         self._signing = signing(b"another key".ljust(32))
         self._links = [common.MAVLink(None, srcSystem=2 + number, srcComponent=1) for number in range(PORTS)]
