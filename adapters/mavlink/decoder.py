@@ -296,8 +296,8 @@ class FrameCounters:
         self._missing = bytearray(256)
         self._unsure: set[int] = set()
 
-    def add(self, counter: int, frame: bytes, *, sure: bool) -> tuple[int, bool]:
-        """Frames newly found missing, and whether this one was counted as missing before."""
+    def add(self, counter: int, frame: bytes, sure: bool) -> tuple[int, bool]:
+        """Frames newly found missing, and whether this one was counted as missing before. `sure`: its checksum is right."""
         if not sure:
             self._unsure.add(counter)
             return 0, False
@@ -372,7 +372,7 @@ class MavlinkDecoder:
         if reader is not None and not is_sound(frame, reader.seed):
             self.counts["bad checksum"] += 1
             return []
-        self._follow(number, component, counter, frame)
+        self._follow(component, counter, frame, sure=reader is not None or self.dialect.knows(number))
         if reader is None:
             self.counts["skipped"] += 1
             return []
@@ -383,14 +383,15 @@ class MavlinkDecoder:
             return reader.handlers[0](fields, t_receive_ns)
         return [event for events in reader.handlers for event in events(fields, t_receive_ns)]
 
-    def _follow(self, number: int, component: int, counter: int, frame: bytes) -> None:
+    def _follow(self, component: int, counter: int, frame: bytes, *, sure: bool) -> None:
         """Count the frames that are missing before this one, by the frame counter of its sender."""
         counters = self._counters.get(component)
         if counters is None:
             counters = self._counters[component] = FrameCounters(counter)
-        lost, late = counters.add(counter, frame, sure=self.dialect.knows(number))
-        self.counts["lost"] += lost
-        self.counts["late"] += late
+        lost, late = counters.add(counter, frame, sure)
+        if lost or late:
+            self.counts["lost"] += lost
+            self.counts["late"] += late
 
     def _adopt(self, system: int, reader: _Reader, frame: bytes) -> bool:
         """Whether this frame makes its system the one whose frames are decoded; if so, it is from now on."""
