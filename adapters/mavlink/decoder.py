@@ -387,6 +387,8 @@ class MavlinkDecoder:
         """Count the frames that are missing before this one, by the frame counter of its sender."""
         counters = self._counters.get(component)
         if counters is None:
+            if not sure:
+                return
             counters = self._counters[component] = FrameCounters(counter)
         lost, late = counters.add(counter, frame, sure)
         if lost or late:
