@@ -41,7 +41,6 @@ from benchmarks.latency import (
     WARM_UP,
     Reading,
     configuration,
-    every,
     free_port,
     process,
     quantiles,
@@ -62,6 +61,7 @@ TICK_S = 0.005  # between two looks at what is due
 PORTS = 40  # of the strangers
 SETTLE_S = 0.5  # after the last datagram
 START_S = 3.0  # from the start of the daemon to that of the attackers: slcan takes two seconds to open
+OUTLAST_S = 4.0  # the subscriber receives for this much longer than the attackers send
 LONGER_S = 8.0  # the vehicle sends for this much longer than the attackers, who take some seconds to start
 OUTCOMES = ("decoded", "skipped", "other systems", "other components", "bad checksum", "undecodable")
 NOT_OUTCOMES = ("sessions", "lost in the kernel's queue", "garbled", "lost")  # other counts of a CAN bus
@@ -92,7 +92,7 @@ ATTACKS = {
     "reloads": Attack(0.2, "reloads of a configuration that is refused"),
 }
 KEY = bytes(range(32))
-HEARTBEAT_HZ = 10
+HEARTBEAT_S = 0.1  # between two of the first TCP client, and of the autopilot that signs
 DATAGRAMS = ("0xFE", "beginnings", "unknown", "mutated", "noise", "strangers", "tiny")
 HELD = 400  # connections that an attacker keeps open
 MOST_AT_ONCE = 200  # times that an attack is made at once, after the attackers' process had to wait
@@ -331,9 +331,9 @@ class Client:
         self._socket.setblocking(False)
         self._link = common.MAVLink(None, srcSystem=1, srcComponent=1)
 
-    def play(self, seconds: float) -> None:
+    def play(self, over: threading.Event) -> None:
         """In a thread."""
-        for _ in every(HEARTBEAT_HZ, seconds):
+        while not over.wait(HEARTBEAT_S):
             packed = heartbeat(self._link)
             try:
                 self.sent += self._socket.send(packed) == len(packed)
@@ -354,11 +354,11 @@ class Signer:
         self._link = signing(KEY)
         self.first = heartbeat(self._link)
 
-    def play(self, port: int, seconds: float) -> None:
+    def play(self, port: int, over: threading.Event) -> None:
         """In a thread."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-            for number in every(HEARTBEAT_HZ, seconds):
-                peer.sendto(heartbeat(self._link) if number else self.first, ("127.0.0.1", port))
+            while not over.wait(HEARTBEAT_S):
+                peer.sendto(heartbeat(self._link) if self.sent else self.first, ("127.0.0.1", port))
                 self.sent += 1
 
 
@@ -374,6 +374,7 @@ class Arena:
         made = settings(folder, self.ports, attacks, self.slcan.channel if self.slcan else "")
         self.daemon = Daemon(made, _refused)
         self.reloads = 0
+        self.over = threading.Event()  # ends the connections of the vehicle that must outlast the attackers
         self.whole_s = seconds + START_S + LONGER_S  # how long the vehicle sends
 
     async def start(self, stack: ExitStack) -> None:
@@ -384,10 +385,10 @@ class Arena:
         self.feed = stack.enter_context(process("--feed", self.ports.udp, "--seconds", self.whole_s))
         self.threads = [
             threading.Thread(target=turn_wheels, args=(self.whole_s,), name="(the benchmark's wheels)"),
-            threading.Thread(target=self.client.play, args=(self.whole_s,), name="(the benchmark's TCP client)"),
+            threading.Thread(target=self.client.play, args=(self.over,), name="(the benchmark's TCP client)"),
         ]
         if "forged" in self.attacks:
-            given = (self.ports.signed, self.whole_s)
+            given = (self.ports.signed, self.over)
             self.threads.append(threading.Thread(target=self.signer.play, args=given, name="(the benchmark's signer)"))
         for thread in self.threads:
             thread.start()
@@ -403,7 +404,7 @@ class Arena:
             given = (self.seconds, ATTACKS["slcan"].rate_hz)
             self.threads.append(threading.Thread(target=self.slcan.play, args=given, name="(the benchmark's slcan)"))
             self.threads[-1].start()
-        reader = stack.enter_context(process("--subscribe", self.ports.zenoh, "--seconds", self.seconds))
+        reader = stack.enter_context(process("--subscribe", self.ports.zenoh, "--seconds", self.seconds + OUTLAST_S))
         await asyncio.to_thread(_line, reader)
         names = ",".join(name for name in self.attacks if name not in ("slcan", "stopped", "reloads"))
         options = ("--seconds", self.seconds, "--seed", self.seed, "--attacks", names)
@@ -424,6 +425,7 @@ class Arena:
     async def end(self) -> None:
         """Wait for the vehicle, let the daemon read the rest, and end it."""
         await asyncio.to_thread(self.feed.wait)
+        self.over.set()
         for thread in self.threads:
             await asyncio.to_thread(thread.join)
         await asyncio.sleep(SETTLE_S)
