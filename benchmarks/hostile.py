@@ -82,7 +82,7 @@ ATTACKS = {
     "noise": Attack(200, "random bytes, up to 300"),
     "strangers": Attack(200, f"valid frames of other systems, from {PORTS} ports, that want the replies"),
     "forged": Attack(100, "to a link with signing: frames unsigned, signed with another key, or played back"),
-    "tiny": Attack(20_000, "datagrams of one byte: more than the daemon reads"),
+    "tiny": Attack(20_000, "datagrams of one byte, 20,000 a second"),
     "thief": Attack(2, "attempts to open the port as well, with SO_REUSEADDR"),
     "clients": Attack(20, "TCP clients that connect beside the first one"),
     "slcan": Attack(50, "garbled lines of a serial CAN adapter, between good ones"),

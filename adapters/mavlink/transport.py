@@ -28,7 +28,7 @@ import serial
 
 DATAGRAM = 65536  # bytes; no UDP datagram is longer
 CHUNK = 4096  # bytes of a stream read at a time
-DATAGRAMS = 32  # read at a time
+DATAGRAMS = 64  # read at a time
 QUEUE_BYTES = 1 << 20  # requested receive buffer of UDP; the kernel gives up to net.core.rmem_max
 SO_RXQ_OVFL = 40  # asm-generic/socket.h; also the type of its control message: datagrams dropped by the kernel so far
 COUNTER = struct.Struct("=I")
