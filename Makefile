@@ -1,6 +1,7 @@
 # make demo    fuse a bundled drive and explain the result (out/demo)
 # make test    lint, types, tests
-# make study   the long studies; make bench the benchmarks; make soak an hour of full load, as fast as possible
+# make study   the long studies; make bench the benchmarks
+# make soak    an hour of full load, as fast as possible; make soak ATTACKED=1 in real time among attackers (MINUTES=60)
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
 # make clean   remove what was made
@@ -36,7 +37,7 @@ bench: $(READY)
 	$(BIN)/python -m benchmarks.run
 
 soak: $(READY)
-	$(BIN)/python -m benchmarks.soak
+	$(BIN)/python -m benchmarks.soak $(if $(ATTACKED),--attacked) $(if $(MINUTES),--minutes $(MINUTES))
 
 # The bundled drive, from the simulator; packed so that the same scenario gives the same bytes.
 demo-data: $(READY)

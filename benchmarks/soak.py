@@ -2,9 +2,12 @@
 the same bytes.
 
     python -m benchmarks.soak [--minutes 60] [--real-time] [--out out/soak]
+    python -m benchmarks.soak --attacked [--as-installed] [--minutes 60] [--seed 1] [--attacks NAME,...]
 
 The load is that of benchmarks.latency. By default frames go straight into the inboxes with stamps of a simulated clock, as
-fast as they are processed. With --real-time they come over UDP and a virtual CAN bus. The exit status is 1 on failure.
+fast as they are processed. With --real-time they come over UDP and a virtual CAN bus. With --attacked they do so among the
+attackers of benchmarks.hostile, and 99 % of the states must arrive in time; nothing is replayed. The exit status is 1 on
+failure.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from typing import BinaryIO
 
 import msgspec
 
+from benchmarks.hostile import ATTACKS, as_installed, report, under_attack
 from benchmarks.latency import CAN_HZ, IMU_HZ, configuration, free_port, process, sent_by_autopilot, turn_wheels
 from fusiond.app.live.daemon import Daemon
 from fusiond.app.replay.replay import Replay, ReplayTask
@@ -42,6 +46,7 @@ APART_NS = 200_000  # between frames of one instant
 WARM_UP_S = 300.0  # after this, memory must stay flat
 FLAT_MB = 2.0
 DIGEST = 8  # bytes of a publication's digest
+IN_TIME_MS = 5.0  # from the instant of a state to the subscriber, 99 %
 LOOKS = 20  # reports of the memory in a run
 
 
@@ -72,16 +77,18 @@ class Memory:
 
     def __init__(self, seconds: float) -> None:
         self.after_warm_up_mb: float | None = None
+        self.latest_mb = 0.0
         self._warm_up_s, self._every = min(WARM_UP_S, seconds / 2), seconds / LOOKS
         self._next = 0.0
 
     def look(self, elapsed_s: float) -> None:
         """Call this often."""
+        self.latest_mb = rss_mb()
         if self.after_warm_up_mb is None and elapsed_s >= self._warm_up_s:
-            self.after_warm_up_mb = rss_mb()
+            self.after_warm_up_mb = self.latest_mb
         if elapsed_s >= self._next:
             self._next += self._every
-            print(f"{elapsed_s:6.0f} s  {rss_mb():7.2f} MB", flush=True)
+            print(f"{elapsed_s:6.0f} s  {self.latest_mb:7.2f} MB", flush=True)
 
     def growth_mb(self) -> float:
         """Since the warm-up."""
@@ -184,13 +191,35 @@ def soak(seconds: float, out: Path, *, real_time: bool) -> bool:
     return growth_mb <= FLAT_MB and accounted and count > 0 and not other
 
 
+def attacked(seconds: float, out: Path, attacks: list[str], seed: int) -> bool:
+    """Run among attackers, print the results, and return whether all is well."""
+    memory = Memory(seconds)
+    result = asyncio.run(under_attack(out, seconds, attacks, seed, memory.look))
+    assert memory.after_warm_up_mb is not None
+    p99_ms = result.p99_ms()
+    growth_mb = memory.latest_mb - memory.after_warm_up_mb  # later this process holds the subscriber's result as well
+    print(report(result))
+    print(f"memory after the warm-up {memory.after_warm_up_mb:.2f} MB, then {growth_mb:+.2f} MB")
+    print(f"99 % of the states arrived within {p99_ms:.2f} ms of their instant; required {IN_TIME_MS:g} ms")
+    return result.good() and growth_mb <= FLAT_MB and p99_ms <= IN_TIME_MS
+
+
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--real-time", action="store_true")
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--real-time", action="store_true")
+    way.add_argument("--attacked", action="store_true")
+    parser.add_argument("--attacks", default=",".join(ATTACKS), help="those of benchmarks.hostile; default: all")
+    parser.add_argument("--as-installed", action="store_true", help="with the priority of the unit; needs a privilege")
+    parser.add_argument("--seed", type=int, default=1, help="of the attackers")
     parser.add_argument("--out", type=Path, default=Path("out/soak"))
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.as_installed:
+        as_installed()
+    if options.attacked:
+        return 0 if attacked(60 * options.minutes, options.out, options.attacks.split(","), options.seed) else 1
     return 0 if soak(60 * options.minutes, options.out, real_time=options.real_time) else 1
 
 

@@ -117,6 +117,8 @@ class CanBus:
     def counts(self) -> dict[str, int]:
         """Counts of frames and of errors of the bus so far."""
         own = {"sessions": self.sessions, "lost in the kernel's queue": self.inbox.missed}
+        if self._driver and self._driver.garbled:
+            own["garbled"] = self._driver.garbled
         decoded = self.decoder.counts if self.decoder else {}
         return {**own, **{name: count for name, count in self._counts.items() if count}, **decoded}
 

@@ -23,6 +23,8 @@ from fusiond.units import nanoseconds
 from fusiond_adapters.can.decoder import EXTENDED, PDU2, CanDecoder
 from fusiond_adapters.can.kernel_socket import CanFrame, CanSocket
 
+PAUSE_S = 0.001  # after a garbled line: a driver that always fails must not use up the processor
+MAX_LINE = 256  # bytes; slcan's longest, of 64 bytes of data, has 139
 ID_BITS = 0x1FFFFFFF
 STANDARD_BITS = 0x7FF
 GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # bits of a J1939 id that hold its PGN, without and with a destination
@@ -34,6 +36,7 @@ class CanDriver:
 
     def __init__(self, decoder: CanDecoder, inbox: Inbox[CanFrame], clock: Clock) -> None:
         self._decoder, self._inbox, self._clock = decoder, inbox, clock
+        self.garbled = 0  # lines that were no frame
 
     @contextmanager
     def opened(self, settings: Can) -> Iterator[can.BusABC]:
@@ -55,9 +58,26 @@ class CanDriver:
         if isinstance(opened, socket.socket) and opened.family == socket.AF_CAN:
             self._read_socket(CanSocket(opened), stop)
         while not stop.is_set():
-            message = bus.recv(POLL_S)
+            try:
+                message = bus.recv(POLL_S)
+            except (can.CanError, ValueError, LookupError) as error:
+                if isinstance(error, can.CanError) and not isinstance(error.__cause__, ValueError):
+                    raise
+                self._drop_line(bus)
+                stop.wait(PAUSE_S)
+                continue
             if message is not None:
                 self._inbox.put(self._clock.from_wall_ns(nanoseconds(message.timestamp)), _frame(message))
+            elif len(getattr(bus, "_buffer", b"")) > MAX_LINE:
+                self._drop_line(bus)
+
+    def _drop_line(self, bus: can.BusABC) -> None:
+        """A text line of a serial adapter (slcan) was garbled: count it, and begin anew with the next. python-can raises
+        what its parser does, keeps a line that is not ASCII, and would raise for it again for ever."""
+        self.garbled += 1
+        line = getattr(bus, "_buffer", None)
+        if isinstance(line, bytearray):
+            line.clear()
 
     def _read_socket(self, reader: CanSocket, stop: Event) -> None:
         before = self._inbox.missed

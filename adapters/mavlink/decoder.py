@@ -15,10 +15,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from operator import itemgetter
 from struct import Struct, calcsize
-from typing import Any
+from typing import Any, cast
 
 import pymavlink.dialects.v20 as dialects
 from fastcrc.crc16 import mcrf4xx
@@ -53,10 +53,11 @@ TIMESYNC_MARK, TIMESYNC_STEP = 117, 1000  # ns: fusiond's requests are stamped i
 TYPE_GROUND_STATION = 6  # MAV_TYPE_GCS
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 
+HALF_TURN = 128  # of the frame counter
+
 UNIX_FROM_US = 10**15  # a stamp beyond this is Unix time (from 2001-09), below it counts from boot
 UNIX_UNTIL_US = 4_102_444_800 * 10**6  # 2100: a later stamp is invalid
 CLOCK_SET_US = 1_262_304_000 * 10**6  # 2010: before this the autopilot's clock is not set
-MAX_LOST = 128  # a larger jump of the frame counter is a repeat or a reordering, not a loss
 
 Bytes = bytes | bytearray
 Pick = Callable[[tuple[Any, ...]], tuple[Any, ...]]
@@ -112,6 +113,10 @@ class Dialect:
             raise ConfigError(f"the MAVLink dialect '{self.name}' has no message {message}")
         return self._types[self.ids[message]]
 
+    def knows(self, number: int) -> bool:
+        """Is a message known by its id, and so the seed of its checksum?"""
+        return number in self._seeds
+
     def sound(self, frame: bytes) -> bool | None:
         """Is the checksum right? None where the message, and so the seed of its checksum, is unknown."""
         seed = self._seeds.get(message_id(frame))
@@ -119,20 +124,27 @@ class Dialect:
 
 
 class FrameSplitter:
-    """Cuts a byte stream into frames. Garbage and frames with a wrong checksum are skipped a byte at a time."""
+    """Cuts a byte stream into frames. Garbage and frames with a wrong checksum are skipped a byte at a time; after
+    `false_starts` in one piece of the stream the rest of it is, so that garbage takes no more time than frames do."""
 
-    def __init__(self, dialect: Dialect) -> None:
+    def __init__(self, dialect: Dialect, false_starts: int = 64) -> None:
         self._dialect = dialect
         self._buffer = bytearray()
         self._in_step = True  # the last frame ended where the buffer begins
+        self._false_starts = false_starts
         self.skipped_bytes = 0
+
+    @property
+    def rest(self) -> bytes:
+        """The bytes that may be the beginning of a frame."""
+        return bytes(self._buffer)
 
     def feed(self, data: bytes) -> list[bytes]:
         """Add the next bytes of the stream; returns the frames that are now complete."""
         buffer = self._buffer
         buffer += data
         frames = []
-        at = 0
+        at = misses = 0
         while len(buffer) - at >= LENGTH_KNOWN:
             length = frame_length(buffer, at)
             if length and len(buffer) - at < length:
@@ -145,7 +157,8 @@ class FrameSplitter:
                 at += length
                 self._in_step = True
             else:
-                found = MAGIC.search(buffer, at + 1)
+                misses += 1
+                found = MAGIC.search(buffer, at + 1) if misses < self._false_starts else None
                 start = found.start() if found else len(buffer)
                 self.skipped_bytes += start - at
                 at = start
@@ -163,6 +176,56 @@ class FrameSplitter:
         if end < len(self._buffer):
             return self._buffer[end] in (MAGIC_1, MAGIC_2)
         return True if self._in_step else None
+
+
+class PeerSplitter:
+    """Frames of several peers: what one sends is never mistaken for a part of another's frame.
+
+    A stream has one peer at a time. A datagram begins anew: the frame that the same peer's last one left incomplete is
+    continued only by a datagram that does not itself begin with a frame (a bridge from a serial line cuts anywhere).
+    """
+
+    PARTS = 64  # incomplete frames that are kept, each of another peer
+    FALSE_STARTS = 16  # in a datagram
+
+    def __init__(self, dialect: Dialect, *, datagrams: bool) -> None:
+        self.skipped_bytes = 0
+        self._dialect, self._datagrams = dialect, datagrams
+        self._parts: dict[Hashable, bytes] = {}
+        self._stream, self._peer = FrameSplitter(dialect), cast(Hashable, None)
+
+    def feed(self, data: bytes, peer: Hashable) -> list[bytes]:
+        """Add a datagram, or the next bytes of a stream; returns the frames that are now complete."""
+        if self._datagrams:
+            return self._feed_datagram(data, peer)
+        if peer != self._peer:
+            self.skipped_bytes += len(self._stream.rest)
+            self._stream, self._peer = FrameSplitter(self._dialect), peer
+        before = self._stream.skipped_bytes
+        frames = self._stream.feed(data)
+        self.skipped_bytes += self._stream.skipped_bytes - before
+        return frames
+
+    def _feed_datagram(self, data: bytes, peer: Hashable) -> list[bytes]:
+        splitter = FrameSplitter(self._dialect, self.FALSE_STARTS)
+        frames = splitter.feed(data)
+        if (part := self._parts.pop(peer, None)) is not None:
+            if frames and data.startswith(frames[0]):
+                self.skipped_bytes += len(part)
+            else:
+                splitter = FrameSplitter(self._dialect, self.FALSE_STARTS)
+                frames = splitter.feed(part + data)
+        self.skipped_bytes += splitter.skipped_bytes
+        if rest := splitter.rest:
+            if len(self._parts) >= self.PARTS:
+                self.skipped_bytes += len(self._parts.pop(next(iter(self._parts))))
+            self._parts[peer] = rest
+        return frames
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes of frames that are not complete yet."""
+        return len(self._stream.rest) + sum(map(len, self._parts.values()))
 
 
 class _Reader:
@@ -219,6 +282,45 @@ def _picking(events: EventsOf, pick: Pick | None) -> EventsOf:
     return events if pick is None else lambda fields, t_receive_ns: events(pick(fields), t_receive_ns)
 
 
+class FrameCounters:
+    """The frame counters of one sender, which go round after 256: what is missing, and what comes late or twice.
+
+    A counter at most half a turn back is late where it was missing, a repeat where it came with the same last bytes (the
+    checksum). Any other that is not the next is a gap, of up to 255. A frame of a message whose checksum is not known is
+    never evidence of a gap: it only says that its own counter is not missing.
+    """
+
+    def __init__(self, first: int) -> None:
+        self._next = first
+        self._seen: list[bytes | None] = [None] * 256  # the end of the frame that came last, by counter
+        self._missing = bytearray(256)
+        self._unsure: set[int] = set()
+
+    def add(self, counter: int, frame: bytes, sure: bool) -> tuple[int, bool]:
+        """Frames newly found missing, and whether this one was counted as missing before. `sure`: its checksum is right."""
+        if not sure:
+            self._unsure.add(counter)
+            return 0, False
+        lost, end = 0, frame[-CHECKSUM:]
+        if counter != self._next:
+            if (self._next - counter) & 0xFF <= HALF_TURN:
+                if self._missing[counter]:
+                    self._missing[counter], self._seen[counter] = 0, end
+                    return 0, True
+                if self._seen[counter] == end:
+                    return 0, False
+            while self._next != counter:
+                missing = self._next not in self._unsure
+                self._missing[self._next], self._seen[self._next] = missing, None
+                lost += missing
+                self._next = self._next + 1 & 0xFF
+        if self._unsure:
+            self._unsure.clear()
+        self._missing[counter], self._seen[counter] = 0, end
+        self._next = counter + 1 & 0xFF
+        return lost, False
+
+
 class MavlinkDecoder:
     """The sources of one [mavlink.NAME] link.
 
@@ -241,9 +343,9 @@ class MavlinkDecoder:
         self._sender = 0  # component of the present frame
         self._boot_clock = boot_clock(link, self.system)
         self._sequences = {} if sequences is None else sequences
-        self._next_counter: dict[int, int] = {}  # by component
+        self._counters: dict[int, FrameCounters] = {}  # by component
         kinds = ("decoded", "skipped", "other systems", "other components", "other instances")
-        self.counts = dict.fromkeys((*kinds, "bad checksum", "undecodable", "lost"), 0)
+        self.counts = dict.fromkeys((*kinds, "bad checksum", "undecodable", "lost", "late"), 0)
 
     def decode(self, frame: bytes, t_receive_ns: int) -> list[Received]:
         """The events in one complete frame; none where the frame is not wanted or not sound (see `counts`)."""
@@ -270,10 +372,7 @@ class MavlinkDecoder:
         if reader is not None and not is_sound(frame, reader.seed):
             self.counts["bad checksum"] += 1
             return []
-        expected = self._next_counter.get(component, counter)
-        self._next_counter[component] = counter + 1 & 0xFF
-        if counter != expected and (counter - expected) & 0xFF < MAX_LOST:
-            self.counts["lost"] += (counter - expected) & 0xFF
+        self._follow(component, counter, frame, sure=reader is not None or self.dialect.knows(number))
         if reader is None:
             self.counts["skipped"] += 1
             return []
@@ -283,6 +382,18 @@ class MavlinkDecoder:
         if len(reader.handlers) == 1:
             return reader.handlers[0](fields, t_receive_ns)
         return [event for events in reader.handlers for event in events(fields, t_receive_ns)]
+
+    def _follow(self, component: int, counter: int, frame: bytes, *, sure: bool) -> None:
+        """Count the frames that are missing before this one, by the frame counter of its sender."""
+        counters = self._counters.get(component)
+        if counters is None:
+            if not sure:
+                return
+            counters = self._counters[component] = FrameCounters(counter)
+        lost, late = counters.add(counter, frame, sure)
+        if lost or late:
+            self.counts["lost"] += lost
+            self.counts["late"] += late
 
     def _adopt(self, system: int, reader: _Reader, frame: bytes) -> bool:
         """Whether this frame makes its system the one whose frames are decoded; if so, it is from now on."""
@@ -295,7 +406,7 @@ class MavlinkDecoder:
             return False
         self.system = system
         self._boot_clock = boot_clock(self.link, system)
-        self._next_counter.clear()
+        self._counters.clear()
         return True
 
     def _make_readers(self, config: Config) -> dict[int, _Reader]:

@@ -25,7 +25,7 @@ from fusiond.ports.inputs import LiveInput
 from fusiond.ports.outputs import Outbox, OutputLost
 from fusiond.units import SECOND
 from fusiond_adapters.mavlink.answers import HANDLED, Parameter, Responder
-from fusiond_adapters.mavlink.decoder import NO_AUTOPILOT, Dialect, FrameSplitter, message_id
+from fusiond_adapters.mavlink.decoder import NO_AUTOPILOT, Dialect, PeerSplitter, message_id
 from fusiond_adapters.mavlink.link import MavlinkLink, link_of
 from fusiond_adapters.mavlink.outgoing import (
     Origin,
@@ -114,7 +114,8 @@ class OwnConnection:
     def __init__(self, transport: Transport, system: Callable[[], int], component: int) -> None:
         self._transport, self._system = transport, system
         self._own_sender = common.MAVLink(None, srcSystem=system(), srcComponent=component)
-        self._splitter = FrameSplitter(Dialect("common"))
+        self._dialect = Dialect("common")
+        self._splitter = PeerSplitter(self._dialect, datagrams=transport.datagrams)
 
     @property
     def identity(self) -> tuple[int, int]:
@@ -128,8 +129,13 @@ class OwnConnection:
         return self._transport.write(packed)
 
     def received(self) -> list[bytes]:
-        frames = [frame for chunk in self._transport.read(0) for frame in self._splitter.feed(chunk)]
-        return [frame for frame in frames if message_id(frame) in HANDLED]
+        found = []
+        for data, peer in self._transport.read(0):
+            frames = self._splitter.feed(data, peer)
+            if any(self._dialect.knows(message_id(frame)) for frame in frames):
+                self._transport.heard(peer)
+            found += [frame for frame in frames if message_id(frame) in HANDLED]
+        return found
 
     def close(self) -> None:
         self._transport.close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from threading import Event, Lock
 from typing import Any
@@ -12,10 +14,13 @@ from fusiond.config.toml import ConfigError
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputContext, InputLost, LiveInput
-from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder, message_id
+from fusiond_adapters.mavlink.decoder import MavlinkDecoder, PeerSplitter, message_id
 from fusiond_adapters.mavlink.housekeeping import Housekeeping
+from fusiond_adapters.mavlink.signing import is_signed
 from fusiond_adapters.mavlink.tlog_record import tlog_record
-from fusiond_adapters.mavlink.transport import Transport, opener
+from fusiond_adapters.mavlink.transport import IN_KERNEL, Transport, opener
+
+PAUSE_S = 0.001  # after a read that stopped at its limit
 
 log = logging.getLogger("fusiond")
 
@@ -36,6 +41,7 @@ class MavlinkLink:
         self.decoder = MavlinkDecoder(config, link)
         self.listeners: list[Callable[[bytes, int], None]] = []
         self.sessions = self.skipped_bytes = self.sent = 0
+        self._counts: Counter[str] = Counter()  # of the transports of all sessions
         self._clock, self._alive = clock, alive
         self._sending = Lock()  # guards packing, and the transport while it is written to
         self._transport: Transport | None = None
@@ -85,26 +91,48 @@ class MavlinkLink:
             return taken
 
     def _serve(self, transport: Transport, stop: Event) -> None:
-        splitter = FrameSplitter(self.decoder.dialect)
-        skipped_before = self.skipped_bytes
-        while not stop.is_set():
-            chunks = transport.read(POLL_S)
-            t_ns = self._clock.now_ns()
-            for chunk in chunks:
-                for frame in splitter.feed(chunk):
-                    if self.housekeeping.signing and not self.housekeeping.signing.accepts(frame):
-                        continue
-                    self.inbox.put(t_ns, frame)
-                    with self._sending:  # it may pack a reply
-                        self.housekeeping.receive(frame, t_ns)
-                    for listen in self.listeners:
-                        listen(frame, t_ns)
-            self.skipped_bytes = skipped_before + splitter.skipped_bytes
-            while self.housekeeping.changes:
-                log.info("%s: %s", self.about, self.housekeeping.changes.pop(0))
-            with self._sending:
-                for frame in self.housekeeping.due(self._clock.now_ns(), alive=self._alive()):
-                    self.sent += transport.write(frame)
+        splitter = PeerSplitter(self.decoder.dialect, datagrams=transport.datagrams)
+        skipped_before, counts_before = self.skipped_bytes, self._counts
+        try:
+            while not stop.is_set():
+                self._receive(transport, splitter)
+                self.skipped_bytes = skipped_before + splitter.skipped_bytes
+                counts = Counter(counts_before)
+                counts.update(transport.counts)
+                self._counts, self.inbox.missed = counts, counts[IN_KERNEL]
+                while self.housekeeping.changes:
+                    log.info("%s: %s", self.about, self.housekeeping.changes.pop(0))
+                with self._sending:
+                    for frame in self.housekeeping.due(self._clock.now_ns(), alive=self._alive()):
+                        self.sent += transport.write(frame)
+                if transport.more:  # a flood: leave the processor to the estimator; the kernel counts what it drops
+                    time.sleep(PAUSE_S)
+        finally:
+            self.skipped_bytes = skipped_before + splitter.skipped_bytes + splitter.waiting_bytes
+
+    def _receive(self, transport: Transport, splitter: PeerSplitter) -> None:
+        """Read what is there, after waiting for it, and pass on its frames."""
+        chunks = transport.read(POLL_S)
+        t_ns = self._clock.now_ns()
+        for data, peer in chunks:
+            valid = False
+            for frame in splitter.feed(data, peer):
+                valid |= self._take(frame, t_ns)
+            if valid:
+                transport.heard(peer)
+
+    def _take(self, frame: bytes, t_ns: int) -> bool:
+        """Pass on a frame, unless its signature is wrong. Whether its sender has shown that it is one: by a checksum whose
+        seed is known; where signing is on, by a signature."""
+        signing = self.housekeeping.signing
+        if signing and not signing.accepts(frame):
+            return False
+        self.inbox.put(t_ns, frame)
+        with self._sending:  # it may pack a reply
+            self.housekeeping.receive(frame, t_ns)
+        for listen in self.listeners:
+            listen(frame, t_ns)
+        return is_signed(frame) if signing else self.decoder.dialect.knows(message_id(frame))
 
     def decode(self, item: bytes, t_ns: int) -> list[Received]:
         """The events in a frame."""
@@ -116,7 +144,7 @@ class MavlinkLink:
 
     def counts(self) -> dict[str, int]:
         """Counts of frames and of the link so far."""
-        own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
+        own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent, **self._counts}
         requests = {f"asked for {name}": wanted.requests for name, wanted in self.housekeeping.wanted.items()}
         rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.housekeeping.wanted.items()}
         signing = self.housekeeping.signing.counts if self.housekeeping.signing else {}

@@ -1,7 +1,9 @@
 """MAVLink 2 signing: frames signed and checked with one key, and a timestamp that never decreases, not even after a restart.
 
-Timestamps count 10 us since 2015. The one on disk is ahead of those sent: before it is reached, one that is a minute ahead
-is written. So after a crash, or with a wall clock that was set back, fusiond continues after everything sent before.
+Timestamps count 10 us since 2015 and follow the wall clock. On disk are two: one that was sent, and one that is not passed
+before the two are written again, a minute later. After a restart the wall clock goes on, unless it is behind the first: it
+was set back. Only then do timestamps run ahead of it, from the second on, by one for each frame; and the second is then a
+second ahead of the first, so that restarts do not add up to more than the peers tolerate (a minute).
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import os
+import stat
 import time
 from pathlib import Path
 from typing import Any
@@ -22,8 +25,10 @@ KEY_SIZE = 32  # bytes
 SIGNATURE_SIZE, DIGEST_SIZE = 13, 6  # bytes: link, timestamp (6), digest (6)
 EPOCH_NS = 1_420_070_400 * SECOND  # 2015
 TICK_NS = 10_000
-MINUTE = 60 * SECOND // TICK_NS  # in timestamps
-MAX_FILE_CHARACTERS = 100  # characters of a timestamp file
+A_SECOND = SECOND // TICK_NS  # in timestamps
+MINUTE = 60 * A_SECOND
+BURST = A_SECOND // 100  # frames sent at once bring the timestamp less than this ahead of the clock
+MAX_FILE_CHARACTERS = 100  # read of either file
 
 
 class Signing:
@@ -34,23 +39,25 @@ class Signing:
         assert settings.signing_key_file is not None and settings.signing_timestamp_file is not None
         self._key = _read_key(config.path(settings.signing_key_file), f"mavlink.{link}.signing_key_file")
         self._file = config.path(settings.signing_timestamp_file)
-        self._last = self._stored = _read_timestamp(self._file, f"mavlink.{link}.signing_timestamp_file")
+        sent, self._limit = _read_timestamps(self._file, f"mavlink.{link}.signing_timestamp_file")
+        self._last = sent if sent < _now() else self._limit
         self._accept_unsigned = settings.accept_unsigned
         self._streams: dict[tuple[int, int, int], int] = {}  # by link id, system and component: the latest timestamp
         self.counts = {"unsigned": 0, "wrongly signed": 0, "timestamp not kept": 0}
 
     def prepare(self, sender: Any) -> None:
         """Make a pymavlink MAVLink sign the next message it packs."""
-        self._last = max(self._last + 1, _now())
-        if self._last > self._stored:
-            self._store(self._last + MINUTE)
+        now = _now()
+        self._last = max(self._last + 1, now)
+        if self._last > self._limit or (self._last > now + BURST and self._limit > self._last + A_SECOND):
+            self._store(self._last + (MINUTE if self._last == now else A_SECOND))
         sender.signing.secret_key = self._key
         sender.signing.sign_outgoing = True
         sender.signing.timestamp = self._last
 
     def accepts(self, frame: bytes) -> bool:
         """Whether a frame is signed with the key and newer than those before it, or may be unsigned. Others are counted."""
-        if frame[0] != MAGIC_2 or not frame[2] & SIGNED:
+        if not is_signed(frame):
             self.counts["unsigned"] += not self._accept_unsigned
             return self._accept_unsigned
         good = self._good(frame)
@@ -71,18 +78,23 @@ class Signing:
         self._streams[stream] = timestamp
         return True
 
-    def _store(self, timestamp: int) -> None:
-        """Write, atomically, the timestamp that a restart continues from."""
+    def _store(self, limit: int) -> None:
+        """Write, atomically, the last timestamp and the limit up to which others may be sent."""
         new = self._file.with_name(self._file.name + ".new")
         try:
             with new.open("w", encoding="ascii") as file:
-                file.write(f"{timestamp}\n")
+                file.write(f"{self._last} {limit}\n")
                 file.flush()
                 os.fsync(file.fileno())
             new.replace(self._file)
         except OSError:
             self.counts["timestamp not kept"] += 1  # the disk is full or read-only: sending must go on
-        self._stored = timestamp
+        self._limit = limit
+
+
+def is_signed(frame: bytes) -> bool:
+    """Has a frame a signature, right or wrong?"""
+    return frame[0] == MAGIC_2 and bool(frame[2] & SIGNED)
 
 
 def _now() -> int:
@@ -91,9 +103,12 @@ def _now() -> int:
 
 def _read_key(path: Path, key: str) -> bytes:
     try:
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            mode, content = os.fstat(file.fileno()).st_mode, file.read(MAX_FILE_CHARACTERS)
     except OSError as error:
         raise ConfigError(f"{key}: {path}: cannot be read: {error.strerror}") from error
+    if mode & (stat.S_IROTH | stat.S_IWOTH):
+        raise ConfigError(f"{key}: {path}: every user can read or write it; chmod o= {path}")
     if len(content) == KEY_SIZE:
         return content
     try:
@@ -105,16 +120,16 @@ def _read_key(path: Path, key: str) -> bytes:
     return secret
 
 
-def _read_timestamp(path: Path, key: str) -> int:
-    """The stored timestamp; 0 if there is no file yet."""
+def _read_timestamps(path: Path, key: str) -> tuple[int, int]:
+    """The stored timestamps: one that was sent, and the limit; 0 if there is no file yet."""
     if not path.parent.is_dir():
         raise ConfigError(f"{key}: no such folder: {path.parent}")
     try:
-        text = path.read_text(encoding="ascii")[:MAX_FILE_CHARACTERS]
+        words = path.read_text(encoding="ascii")[:MAX_FILE_CHARACTERS].split()
     except FileNotFoundError:
-        return 0
+        return 0, 0
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{key}: {path}: cannot be read: {error}") from error
-    if not text.strip().isdecimal():
+    if len(words) not in (1, 2) or not all(word.isdecimal() for word in words):
         raise ConfigError(f"{key}: {path}: holds no timestamp; remove it to start again")
-    return int(text)
+    return int(words[0]), int(words[-1])

@@ -32,8 +32,8 @@ BO_ 256 AXLE: 8 ECU
 """
 
 
-def configuration(folder: Path, connection: str, more: str = "", channel: str = "none") -> Config:
-    """One link, one virtual bus, a vehicle at rest with a given heading."""
+def configuration(folder: Path, connection: str, more: str = "", channel: str = "none", link: str = "") -> Config:
+    """One link (with more keys in `link`), one virtual bus, a vehicle at rest with a given heading."""
     (folder / "axle.dbc").write_text(DBC)
     text = f"""
 [vehicle]
@@ -46,6 +46,7 @@ rate_hz = 100.0
 reopen_max_s = 0.2
 [mavlink.fc]
 connection = "{connection}"
+{link}
 [can.car]
 dbc = ["axle.dbc"]
 interface = "virtual"

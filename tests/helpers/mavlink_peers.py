@@ -82,6 +82,10 @@ class UdpPeer:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(0.01)
 
+    def follow(self, other: UdpPeer) -> None:
+        """Send to the same link as another peer."""
+        self._address = other._address
+
     def send(self, data: bytes) -> None:
         self._socket.sendto(data, self._address)
 
@@ -152,11 +156,13 @@ class Endpoint:
     def __init__(self, peer: Peer, system: int = SYSTEM, component: int = COMPONENT) -> None:
         self.peer = peer
         self.messages: list[Any] = []
+        self.sent = 0
         self.sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self._parser = dialect.MAVLink(None)
         self._parser.robust_parsing = True
 
     def send(self, message: Any) -> None:
+        self.sent += 1
         self.peer.send(bytes(message.pack(self.sender)))
         self.sender.seq = (self.sender.seq + 1) & 0xFF
 
@@ -192,9 +198,9 @@ class Endpoint:
         return whole
 
 
-def link_to(peer: Peer, folder: Path, more: str = "") -> tuple[Config, MavlinkLink]:
-    """A link to a peer."""
-    settings = configuration(folder, peer.connection, more)
+def link_to(peer: Peer, folder: Path, more: str = "", link: str = "") -> tuple[Config, MavlinkLink]:
+    """A link to a peer; `link` has more keys of its section."""
+    settings = configuration(folder, peer.connection, more, link=link)
     return settings, link_of(settings)
 
 

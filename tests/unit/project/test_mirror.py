@@ -19,6 +19,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "adapters/zenoh/test_security.py": "the sample configurations for TLS and access control",
     "app/commands/test_command_line.py": "all commands, by their command lines",
     "app/commands/test_commands.py": "what every command has in common",
+    "app/live/test_hostile.py": "the daemon among hostile processes: UDP, signing, network namespace",
     "filter/observations/test_observations.py": "every observation model of the table",
     "filter/test_closed_forms.py": "decisions of the filter against the closed forms of tests/oracles",
     "filter/kernel/test_generated.py": "what tools/translate_kernel made, against what it would make",

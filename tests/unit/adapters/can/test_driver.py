@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import tty
 from itertools import count
 from pathlib import Path
 from threading import Event
@@ -97,3 +100,24 @@ def test_a_bus_that_cannot_be_opened_and_one_that_is_lost(tmp_path: Path) -> Non
         pass
     with pytest.raises(InputLost, match="lost: gone"), made.opened(virtual):
         raise can.CanOperationError("gone")
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        b"t1q0\r", b"t\r", b"T12\r", b"tzzz2ABCD\r", b"t1002XY\r", b"\xff\xfe\r", b"\x80" * 40 + b"\rt\r",
+        b"x" * 5000 + b"\r", b"\xa5" * 2000 + b"\r", b"T1234567g\r\xff\r",
+    ],
+)  # fmt: skip
+def test_a_garbled_line_of_a_serial_adapter_does_not_drop_the_bus(tmp_path: Path, noise: bytes) -> None:
+    """The frames before and after it come, in one session, and it is counted."""
+    stop, (master, slave) = Event(), pty.openpty()
+    tty.setraw(slave)
+    made, inbox = driver(tmp_path, stop, frames=4)
+    with can.Bus(interface="slcan", channel=os.ttyname(slave), sleep_after_open=0.0) as bus:
+        os.write(master, b"t1002ABCD\r" + noise + b"t1002ABCE\r" + noise + b"t1002ABCF\rt1002ABD0\r")
+        made.read(bus, stop)
+    assert [item.data for _, item in inbox.take()] == [b"\xab\xcd", b"\xab\xce", b"\xab\xcf", b"\xab\xd0"]
+    assert made.garbled >= 2
+    os.close(master)
+    os.close(slave)

@@ -14,7 +14,14 @@ from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
 from fusiond.events import ClockPair, GnssPosition, GnssVelocity, ImuSample, Invalid, Received
-from fusiond_adapters.mavlink.decoder import Dialect, FrameSplitter, MavlinkDecoder, frame_length, message_id
+from fusiond_adapters.mavlink.decoder import (
+    Dialect,
+    FrameSplitter,
+    MavlinkDecoder,
+    PeerSplitter,
+    frame_length,
+    message_id,
+)
 
 UNIX_US = 1_700_000_000_000_000
 T_NS = 1_700_000_000_250_000_000
@@ -268,6 +275,44 @@ def test_counts_of_lost_and_damaged_frames() -> None:
     assert reader.counts["undecodable"] == 4
 
 
+def numbered(count: int) -> list[bytes]:
+    sender = Sender()
+    return [sender.highres(time_usec=1_000_000 + 10_000 * number) for number in range(count)]
+
+
+@pytest.mark.parametrize("gap", [1, 127, 128, 200, 255])
+def test_a_gap_of_any_size_is_counted_and_not_again_with_the_next_frame(gap: int) -> None:
+    reader, frames = decoder(), numbered(600)
+    for frame in frames[:150] + frames[150 + gap :]:
+        reader.decode(frame, T_NS)
+    assert (reader.counts["lost"], reader.counts["late"]) == (gap, 0)
+
+
+def test_frames_out_of_order_are_late_and_repeats_are_nothing() -> None:
+    reader, frames = decoder(), numbered(20)
+    for number in (0, 1, 3, 2, 4, 7, 5, 6, 7, 7, 8, 3, 9):
+        reader.decode(frames[number], T_NS)
+    assert (reader.counts["lost"], reader.counts["late"]) == (3, 3)
+    for frame in frames[10:]:
+        reader.decode(frame, T_NS)
+    assert reader.counts["lost"] == 3
+
+
+def test_messages_that_no_checksum_confirms_make_no_loss_and_hide_none() -> None:
+    reader, frames = decoder(), numbered(400)
+    for number, frame in enumerate(frames):
+        unknown = bytearray(frame)
+        unknown[7:10] = b"\xff\xff\xff"
+        if number % 3 == 0:
+            reader.decode(bytes(unknown), T_NS)  # the autopilot's own, which the dialect lacks
+        elif number not in (100, 101):
+            reader.decode(frame, T_NS)
+        unknown[4] = number * 37 & 0xFF  # a stranger's, with a counter of its own
+        if number % 7 == 1:
+            reader.decode(bytes(unknown), T_NS)
+    assert reader.counts["lost"] == 2
+
+
 @pytest.mark.parametrize(("name", "missing"), [("martian", "known: .*common"), ("minimal", "SYSTEM_TIME|HIGHRES_IMU")])
 def test_a_dialect_that_does_not_do(name: str, missing: str) -> None:
     settings_ = config.parse(f'[mavlink.fc]\ndialect = "{name}"\n[imu.imu0]\nlink = "fc"')
@@ -319,3 +364,65 @@ def test_flipped_bits_never_raise_and_never_lie(data: st.DataObject) -> None:
     for bit in data.draw(st.lists(st.integers(0, 8 * len(frame) - 1), min_size=1, max_size=3, unique=True)):
         frame[bit // 8] ^= 1 << bit % 8
     assert decoder().decode(bytes(frame), T_NS) in ([], good)
+
+
+def hostile(size: int = 255) -> bytes:
+    """The beginning of a frame of an unknown message that claims `size` bytes."""
+    return bytes((0xFD, size, 0, 0, 9, 1, 1, 0xFF, 0xFF, 0xFF))
+
+
+def test_beginnings_of_frames_swallow_no_datagram() -> None:
+    """28 of 10 bytes in a second swallowed two thirds of the vehicle's frames."""
+    splitter, frames = PeerSplitter(Dialect("ardupilotmega"), datagrams=True), numbered(300)
+    found = []
+    for frame in frames:
+        splitter.feed(hostile(), "stranger")
+        splitter.feed(hostile(), "vehicle")  # with a forged address
+        found += splitter.feed(frame, "vehicle")
+    assert found == frames
+    assert splitter.skipped_bytes + splitter.waiting_bytes == 2 * 10 * len(frames)
+
+
+@pytest.mark.parametrize("size", [1, 20, 100])
+def test_frames_that_a_bridge_cuts_into_datagrams_are_put_together(size: int) -> None:
+    frames = numbered(20)
+    stream = b"".join(frames)
+    splitter = PeerSplitter(Dialect("ardupilotmega"), datagrams=True)
+    found = []
+    for at in range(0, len(stream), size):
+        found += splitter.feed(stream[at : at + size], "bridge")
+        splitter.feed(hostile(), at)  # of as many strangers
+    assert found == frames
+
+
+def test_incomplete_frames_of_many_peers_are_bounded_and_counted() -> None:
+    splitter = PeerSplitter(Dialect("ardupilotmega"), datagrams=True)
+    for peer in range(1000):
+        splitter.feed(hostile(), peer)
+    assert splitter.waiting_bytes == 10 * PeerSplitter.PARTS
+    assert splitter.skipped_bytes == 10 * (1000 - PeerSplitter.PARTS)
+
+
+def test_the_next_peer_of_a_stream_begins_anew() -> None:
+    splitter, (frame,) = PeerSplitter(Dialect("ardupilotmega"), datagrams=False), numbered(1)
+    assert splitter.feed(hostile(), 1) == []
+    assert splitter.feed(frame[:20], 2) == []
+    assert splitter.feed(frame[20:], 2) == [frame]
+    assert splitter.skipped_bytes == 10
+
+
+@pytest.mark.parametrize("datagrams", [True, False])
+def test_garbage_is_not_searched_at_every_byte(datagrams: bool) -> None:
+    """Each byte of 0xFE begins a frame of 262 bytes, whose checksum would be computed."""
+    checked = []
+
+    class Counting(Dialect):
+        def sound(self, frame: bytes) -> bool | None:
+            checked.append(len(frame))
+            return super().sound(frame)
+
+    splitter = PeerSplitter(Counting("ardupilotmega"), datagrams=datagrams)
+    for _ in range(10):
+        splitter.feed(b"\xfe" * 4096, "stranger")
+    assert len(checked) <= 10 * 64
+    assert splitter.skipped_bytes + splitter.waiting_bytes == 10 * 4096

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import socket
 from pathlib import Path
 from threading import Event, Thread
@@ -50,6 +51,88 @@ def test_messages_are_sent_only_while_it_is_open(tmp_path: Path) -> None:
         endpoint.until(lambda: [m.value for m in endpoint.of("NAMED_VALUE_INT")] == [5])
         assert link.counts()["sent"] > sent
     assert not link.send(heartbeat())
+    peer.close()
+
+
+def test_messages_go_to_peers_that_sent_valid_frames(tmp_path: Path) -> None:
+    """Garbage, the beginning of a frame and a message of unknown checksum do not make a recipient."""
+    peer, stranger = UdpPeer(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    stranger.settimeout(0.05)
+    _, link = link_to(peer, tmp_path)
+    endpoint = Endpoint(peer)
+    unknown = bytes((0xFD, 2, 0, 0, 1, 7, 1, 0xFF, 0xFF, 0xFF, 0, 0, 0, 0))
+    address = ("127.0.0.1", int(peer.connection.rpartition(":")[2]))
+    with serving(link), stranger:
+        endpoint.until(lambda: link.sessions == 1)
+        for data in (b"garbage", unknown[:10], unknown):
+            stranger.sendto(data, address)
+        greeted(endpoint, link)
+        endpoint.until(lambda: link.counts()["datagrams"] >= 4)
+        assert link.send(common.MAVLink_named_value_int_message(0, b"test", 5))
+        endpoint.until(lambda: bool(endpoint.of("NAMED_VALUE_INT")))
+        with pytest.raises(TimeoutError):
+            stranger.recv(100)
+    peer.close()
+
+
+def test_where_signing_is_on_messages_go_to_those_who_sign(tmp_path: Path) -> None:
+    (tmp_path / "key").write_bytes(bytes(32))
+    (tmp_path / "key").chmod(0o600)
+    peer, stranger = UdpPeer(), UdpPeer()
+    text = 'signing_key_file = "key"\nsigning_timestamp_file = "stamp"\naccept_unsigned = true'
+    _, link = link_to(peer, tmp_path, link=text)
+    stranger.follow(peer)
+    endpoint, other = Endpoint(peer), Endpoint(stranger, system=8)
+    endpoint.sender.signing.secret_key, endpoint.sender.signing.sign_outgoing = bytes(32), True
+    endpoint.sender.signing.timestamp = 1 << 47  # later than any
+    with serving(link):
+        endpoint.until(lambda: link.sessions == 1)
+        other.heartbeat()
+        greeted(endpoint, link)
+        endpoint.until(lambda: link.send(common.MAVLink_named_value_int_message(0, b"test", 5)))
+        endpoint.until(lambda: bool(endpoint.of("NAMED_VALUE_INT")))
+        assert link.counts()["unsigned"] == 0  # they may come
+        assert stranger.receive() == b""
+    peer.close()
+    stranger.close()
+
+
+def test_every_byte_of_a_link_is_accounted_for(tmp_path: Path) -> None:
+    """Sent: whole frames, broken ones, beginnings of frames, garbage, a frame cut in two; read in one session."""
+    peer, noise = UdpPeer(), random.Random(7)
+    _, link = link_to(peer, tmp_path)
+    endpoint, sent = Endpoint(peer), [0, 0]
+
+    def send(data: bytes) -> None:
+        peer.send(data)
+        sent[0], sent[1] = sent[0] + 1, sent[1] + len(data)
+
+    def frame() -> bytes:
+        packed = bytes(heartbeat().pack(endpoint.sender))
+        endpoint.sender.seq = (endpoint.sender.seq + 1) & 0xFF
+        return packed
+
+    with serving(link):
+        endpoint.until(lambda: link.sessions == 1)
+        greeted(endpoint, link)
+        endpoint.until(lambda: link.counts()["datagrams"] == endpoint.sent)
+        whole_before = link.inbox.received
+        for number in range(400):
+            data = bytearray(frame())
+            if number % 4 == 1:
+                data[noise.randrange(len(data))] ^= 1 << noise.randrange(8)
+            send(bytes(data[: noise.randrange(1, len(data))] if number % 4 == 2 else data))
+            if number % 4 == 3:
+                send(noise.randbytes(noise.randrange(1, 300)))
+        endpoint.until(lambda: link.counts()["datagrams"] == endpoint.sent + sent[0])
+    counts, frames = link.counts(), [data for _, data in link.inbox.take()]
+    assert counts["lost in the kernel's queue"] == link.inbox.dropped == 0
+    assert sum(map(len, frames[whole_before:])) + counts["garbage bytes"] == sent[1]
+    assert len(frames) - whole_before >= 200
+    for data in frames:
+        link.decode(data, 1)
+    kinds = ("decoded", "skipped", "other systems", "other components", "bad checksum", "undecodable")
+    assert sum(link.counts()[kind] for kind in kinds) == len(frames)
     peer.close()
 
 

@@ -1,4 +1,5 @@
-"""The sample configurations for TLS and access control: who has no certificate stays out, who has one does only its own."""
+"""The sample configurations for TLS and access control: who has no certificate stays out, who has one does only its own.
+Without certificates, who connects can only read."""
 
 from __future__ import annotations
 
@@ -9,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
+from typing import Literal
 
+import msgspec
 import pytest
 import zenoh
 
@@ -20,12 +23,12 @@ from fusiond.messages.types import EventMessage
 from fusiond_adapters.zenoh.queries import Answers
 from fusiond_adapters.zenoh.session import ZenohPublisher, open_session, session_config
 from tests.helpers.paths import ROOT
+from tests.helpers.zenoh import endpoint as free_endpoint
+from tests.helpers.zenoh import publishing, settings
 
 SAMPLES = ROOT / "configs" / "zenoh"
 DEADLINE = 15.0  # s
 PLACE = "/etc/fusiond/zenoh"
-
-pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes its certificates with openssl")
 
 
 def openssl(*arguments: object) -> None:
@@ -35,6 +38,8 @@ def openssl(*arguments: object) -> None:
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The samples, with certificates, in a folder of their own."""
+    if shutil.which("openssl") is None:
+        pytest.skip("makes its certificates with openssl")
     folder = tmp_path_factory.mktemp("zenoh")
     curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", 2)
     openssl("req", "-x509", *curve, "-subj", "/CN=authority", "-keyout", folder / "ca.key", "-out", folder / "ca.pem")
@@ -141,3 +146,30 @@ def test_a_router_of_another_authority_is_not_trusted(samples: Path, endpoint: s
     (tmp_path / "reader.json5").write_text(text)
     with pytest.raises(ClientError, match="Unable to connect"):
         Client(endpoint, "rover", config_file=tmp_path / "reader.json5")
+
+
+@pytest.mark.parametrize("file", [None, SAMPLES / "read-only.json5"])
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_a_process_that_connects_can_publish_unless_forbidden(file: Path | None, mode: Literal["client", "peer"]) -> None:
+    """A reader and a forger, both connected to fusiond; no certificates."""
+    where, came, heard = free_endpoint(), Event(), list[str]()
+    config = settings(where)
+    config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, config_file=file and str(file)))
+
+    def listen(message: EventMessage) -> None:
+        heard.append(message.text)
+        if message.text == "true":
+            came.set()
+
+    with (
+        publishing(config) as output,
+        Client(where, "rover") as client,
+        client.subscribed(EventMessage, listen),
+        open_session(Zenoh(mode=mode, listen=[], connect=[where])) as session,
+        ZenohPublisher(session, "rover", "json") as forger,
+    ):
+        forger.publish(event("forged"))
+        list(session.get("fusiond/rover/info", timeout=1.0))  # an answer shows that fusiond has processed everything before
+        output.outbox.put(event("true"))
+        assert came.wait(DEADLINE)
+    assert ("forged" in heard) == (file is None)
