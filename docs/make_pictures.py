@@ -25,7 +25,7 @@ from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.summary import Summary
 from fusiond.app.replay.truth import Truth, displacement, parse_truth
-from fusiond.app.top.view import View, screen
+from fusiond.app.top.view import Place, View, page
 from fusiond.config import load as config
 from fusiond.estimator.fusion import solution_state
 from fusiond.filter.source_health import STATUSES
@@ -324,7 +324,7 @@ def save(figure: Figure, name: str) -> None:
 # --- What `fusiond top` shows
 
 TOP_SECOND = 62.0  # of the bundled drive: eight seconds into the tunnel
-TOP_COLUMNS = 122
+TOP_COLUMNS, TOP_LINES = 122, 32
 INKS = {"plain": "#d8d8d8", "dim": "#808080", "bold": "#ffffff", "green": "#50c878", "yellow": "#f0c040", "red": "#ff6060"}
 COLUMN, ROW, MARGIN = 8, 17, 12  # pixels
 PLAIN, BOLD = "DejaVuSansMono", "DejaVuSansMono-Bold"  # fonts that come with matplotlib
@@ -344,7 +344,7 @@ def draw_top() -> None:
 
     logs = open_logs([str(demo.DRIVE / log) for log in demo.LOGS], settings)
     Replay(settings, ReplayTask(50.0, on_message=[take])).run(logs)
-    lines = screen(view, 0.0, TOP_COLUMNS, 30)
+    lines = page(view, 0.0, TOP_COLUMNS, TOP_LINES, Place())
     picture = Image.new("RGB", (TOP_COLUMNS * COLUMN + 2 * MARGIN, len(lines) * ROW + 2 * MARGIN), "#101418")
     folder = Path(get_data_path(), "fonts", "ttf")
     fonts = {name: ImageFont.truetype(str(folder / f"{name}.ttf"), 13) for name in (PLAIN, BOLD)}
