@@ -33,7 +33,7 @@ Panel = dict[str, Any]
 
 
 def layout(config: Config) -> Panel:
-    """The layout: the modes over the whole width; map and 3-D view on the left, plots on the right; events and health below."""
+    """The layout: modes over the whole width; map and 3-D view on the left, plots on the right; events and health below."""
     panels = {
         "map!place": _map(),
         "3D!scene": _scene(),
