@@ -355,7 +355,8 @@ def draw_odometry() -> None:
     t, x, y, x_odom, y_odom, sigma, north, east, turn = np.array(rows).T
     sine, cosine = math.sin(turn[0]), math.cos(turn[0])  # of odom against the truth, where it begins
     east, north = east - east[0], north - north[0]
-    error = np.hypot(x_odom - x_odom[0] - (cosine * east - sine * north), y_odom - y_odom[0] - (sine * east + cosine * north))
+    true_x, true_y = cosine * east - sine * north, sine * east + cosine * north
+    error = np.hypot(x_odom - x_odom[0] - true_x, y_odom - y_odom[0] - true_y)
     figure = figure_of(9, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     left.plot(x, y, color=BLUE, label="odometry, in map")
