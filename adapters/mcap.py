@@ -76,7 +76,7 @@ class McapFile:
             self.flush()
             self._second = second
         self.waiting += 1
-        self._writer.add_message(channel, record.log_ns, record.data, record.publish_ns)
+        self._writer.add_message(channel, record.publish_ns, record.data, record.publish_ns)  # logged as it is published
 
     def flush(self) -> None:
         """End the chunk, so that its records survive a crash of this process."""

@@ -21,15 +21,18 @@ from PIL import Image, ImageDraw, ImageFont
 
 from fusiond.app.demo import demo
 from fusiond.app.replay.comparison import Window
+from fusiond.app.replay.files import truth_of
 from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.summary import Summary
 from fusiond.app.replay.truth import Truth, displacement, parse_truth
-from fusiond.app.top.view import View, screen
+from fusiond.app.top.view import Place, View, page
 from fusiond.config import load as config
 from fusiond.estimator.fusion import solution_state
 from fusiond.filter.source_health import STATUSES
 from fusiond.filter.state import CHOOSING, LAST_SPEED, PHASE
+from fusiond.messages.drift import Drift
+from fusiond.messages.local_frame import LocalFrame, OdometryFrame
 from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMessage
 from fusiond.simulation.scenario import parse
 from fusiond.units import SECOND, nanoseconds
@@ -321,10 +324,62 @@ def save(figure: Figure, name: str) -> None:
     shrink(IMAGES / name)
 
 
+# --- Two odometries
+
+
+def draw_odometry() -> None:
+    """The bundled drive in map and in odom, and the error in odom since it began."""
+    settings = config.load(demo.DRIVE / "fusiond.toml")
+    odometry, drift, frames = OdometryFrame(), Drift(), list[LocalFrame]()
+    truth = truth_of(demo.DRIVE / "truth.csv.gz")
+    rows: list[tuple[float, ...]] = []
+
+    def take(message: Message) -> None:
+        if not isinstance(message, StateMessage) or message.state is None:
+            return
+        frames[:] = frames or [LocalFrame.at(message.state)]
+        local = frames[0].state(message.state)
+        _, body = odometry.follow(message.t_ns, local, message.resets)
+        drift.follow(message.t_ns, local, body, message.state.sigma_gyro_bias_rps)
+        covariance = drift.covariance(local, body)
+        sigma = math.sqrt(covariance[0] + covariance[7])
+        true = truth.at(message.t_ns)
+        if true is not None:
+            place = displacement(true.lat_deg, true.lon_deg, origin_deg(frames[0]), true.height_m)
+            w, x, y, z = body.quaternion
+            turn = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - (math.pi / 2 - math.radians(true.yaw_deg))
+            rows.append((message.t_ns / SECOND, *local.position_l[:2], *body.position[:2], sigma, *place, turn))
+
+    logs = open_logs([str(demo.DRIVE / log) for log in demo.LOGS], settings)
+    Replay(settings, ReplayTask(20.0, on_message=[take])).run(logs)
+    t, x, y, x_odom, y_odom, sigma, north, east, turn = np.array(rows).T
+    sine, cosine = math.sin(turn[0]), math.cos(turn[0])  # of odom against the truth, where it begins
+    east, north = east - east[0], north - north[0]
+    true_x, true_y = cosine * east - sine * north, sine * east + cosine * north
+    error = np.hypot(x_odom - x_odom[0] - true_x, y_odom - y_odom[0] - true_y)
+    figure = figure_of(9, 3.8)
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
+    left.plot(x, y, color=BLUE, label="odometry, in map")
+    left.plot(x_odom, y_odom, "--", color=VERMILION, linewidth=1.2, label="odometry/local, in odom")
+    left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    left.legend(loc="best", frameon=False, fontsize=8)
+    right.fill_between(t - t[0], 0, 2 * sigma, color=GREEN, alpha=0.25, linewidth=0, label="2 sigma, as published")
+    right.plot(t - t[0], error, color=VERMILION, label="error of odometry/local since it began")
+    right.set(xlabel="time since the first state [s]", ylabel="m", xlim=(0, t[-1] - t[0]), ylim=(0, None))
+    right.legend(loc="upper left", frameon=False, fontsize=8)
+    right.set_title("odom drifts, and says how far", loc="left", fontsize=10)
+    save(figure, "odometry.png")
+
+
+def origin_deg(frame: LocalFrame) -> tuple[float, float]:
+    """Latitude and longitude of a frame's origin [deg]."""
+    return math.degrees(frame.origin[0]), math.degrees(frame.origin[1])
+
+
 # --- What `fusiond top` shows
 
 TOP_SECOND = 62.0  # of the bundled drive: eight seconds into the tunnel
-TOP_COLUMNS = 122
+TOP_COLUMNS, TOP_LINES = 122, 32
 INKS = {"plain": "#d8d8d8", "dim": "#808080", "bold": "#ffffff", "green": "#50c878", "yellow": "#f0c040", "red": "#ff6060"}
 COLUMN, ROW, MARGIN = 8, 17, 12  # pixels
 PLAIN, BOLD = "DejaVuSansMono", "DejaVuSansMono-Bold"  # fonts that come with matplotlib
@@ -344,7 +399,7 @@ def draw_top() -> None:
 
     logs = open_logs([str(demo.DRIVE / log) for log in demo.LOGS], settings)
     Replay(settings, ReplayTask(50.0, on_message=[take])).run(logs)
-    lines = screen(view, 0.0, TOP_COLUMNS, 30)
+    lines = page(view, 0.0, TOP_COLUMNS, TOP_LINES, Place())
     picture = Image.new("RGB", (TOP_COLUMNS * COLUMN + 2 * MARGIN, len(lines) * ROW + 2 * MARGIN), "#101418")
     folder = Path(get_data_path(), "fonts", "ttf")
     fonts = {name: ImageFont.truetype(str(folder / f"{name}.ttf"), 13) for name in (PLAIN, BOLD)}
@@ -366,6 +421,7 @@ PICTURES = {
     "arrival": draw_arrival,
     "bank": draw_bank,
     "slip": draw_slip,
+    "odometry": draw_odometry,
     "top": draw_top,
 }
 

@@ -21,6 +21,8 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion, Receipt
 from fusiond.events import ImuSample, Received
@@ -28,7 +30,7 @@ from fusiond.filter.stored_state import StoredState
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.outcomes import totals
 from fusiond.messages.schedule import RATE_DENOMINATOR, IoHealth, Publication
-from fusiond.messages.types import Message, StateMessage
+from fusiond.messages.types import HealthMessage, Message, StateMessage
 from fusiond.units import SECOND
 
 MAX_SILENCE_NS = 60 * SECOND  # ticks continue for this long after an event; in a longer gap they are skipped
@@ -77,6 +79,7 @@ class Engine:
         self._imu = self.fusion.params.sources[self.fusion.params.imu_source]
         self._tick = 0  # number of the next tick
         self._prepared: StateMessage | None = None  # its state, if no event comes before it
+        self._newest: StateMessage | None = None  # the state of the last tick
         self._last: tuple[int, StateMessage] | None = None  # the last tick, until its other messages are published
 
     @property
@@ -159,6 +162,14 @@ class Engine:
         """The state message of an instant."""
         return state_message(self.fusion.solution_at(t_ns), self._vehicle, totals(self.fusion))
 
+    def health(self, t_ns: int) -> HealthMessage | None:
+        """The health at an instant without a tick: before the first event, or while ticks pause."""
+        if self.publication is None:
+            return None
+        state = self._newest or self.message(t_ns)
+        since_ns = 0 if self.first_ns is None else t_ns - self.origin_ns
+        return self.publication.health(since_ns, replace(state, t_ns=t_ns))
+
     # --- Ticks
 
     def _since(self, number: int) -> int:
@@ -189,7 +200,7 @@ class Engine:
         if self._pace:
             self._pace(since_ns)
         state, self._prepared = self._prepared or self.message(self.origin_ns + since_ns), None
-        self._last = since_ns, state
+        self._last, self._newest = (since_ns, state), state
         self.ticks += 1
         self._tick += 1
         self._sink(state)

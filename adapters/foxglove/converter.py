@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, NamedTuple
 
@@ -33,6 +34,7 @@ from fusiond.messages.types import (
 from fusiond.units import SECOND
 
 ROOT, BODY = "local_enu", "base_link"  # frames
+TRAIL_POINTS, TRAIL_STEP_M = 300, 2.0  # how far back the trail goes
 KNOWN = 3  # position_covariance_type
 LEVELS: dict[Severity, int] = {"info": 2, "notice": 2, "warning": 3, "critical": 4}  # of foxglove.Log
 
@@ -51,8 +53,7 @@ class Record(NamedTuple):
     """A message on a topic."""
 
     topic: str
-    log_ns: int  # the instant it is valid for
-    publish_ns: int  # when it was published
+    publish_ns: int  # when it was published; the instant it is valid for is in the data
     data: bytes
 
 
@@ -112,6 +113,14 @@ class PoseInFrame(Struct, frozen=True):
     pose: PoseOf
 
 
+class PosesInFrame(Struct, frozen=True):
+    """Where the body was, in the local frame."""
+
+    timestamp: Time
+    frame_id: str
+    poses: list[PoseOf]
+
+
 class FrameTransform(Struct, frozen=True):
     """The child frame's position and attitude in the parent frame."""
 
@@ -133,9 +142,11 @@ class Log(Struct, frozen=True):
     line: int
 
 
-LOCATION, ORIGIN, POSE, TRANSFORM, LOG = (f"/fusiond/{name}" for name in ("location", "origin", "pose", "tf", "log"))
+LOCATION, ORIGIN, POSE, TRAIL, TRANSFORM, LOG = (
+    f"/fusiond/{name}" for name in ("location", "origin", "pose", "trail", "tf", "log")
+)
 FOXGLOVE: dict[str, type[Struct]] = {
-    LOCATION: LocationFix, ORIGIN: LocationFix, POSE: PoseInFrame, TRANSFORM: FrameTransform, LOG: Log,
+    LOCATION: LocationFix, ORIGIN: LocationFix, POSE: PoseInFrame, TRAIL: PosesInFrame, TRANSFORM: FrameTransform, LOG: Log,
 }  # fmt: skip
 TOPICS: dict[type[Message], str] = {
     kind: f"/fusiond/{name}"
@@ -219,25 +230,26 @@ class Converter:
         self._turns: dict[type[Message], tuple[object, ...]] = {}  # by kind: mode, resets and number of the last period
         self._origin: _Origin | None = None
         self._origin_second: int | None = None  # in which the origin was last published
-        self._tick_ns: int | None = None  # the latest
+        self._trail: deque[tuple[float, float, float]] = deque(maxlen=TRAIL_POINTS)
+        self._published_ns: int | None = None  # when the latest message was published
 
     def records(self, message: Message) -> Iterator[Record]:
         """The records of a message; none if a state is not due."""
         if not isinstance(message, StateAtInstant | HealthMessage | InnovationMessage | EventMessage):
             return
-        if isinstance(message, StateMessage):
-            self._tick_ns = message.t_ns  # the first message of a tick
         if isinstance(message, StateAtInstant) and not self._is_due(message):
             return
-        log_ns, publish_ns = message.t_ns, self._tick_ns or message.t_ns
+        if not isinstance(message, SettledMessage | InnovationMessage):  # these are of an instant before their publication
+            self._published_ns = message.t_ns
+        publish_ns = self._published_ns or message.t_ns
         topic = innovations_topic(message.source) if isinstance(message, InnovationMessage) else TOPICS[type(message)]
-        yield Record(topic, log_ns, publish_ns, encode(message, "json"))
+        yield Record(topic, publish_ns, encode(message, "json"))
         if isinstance(message, EventMessage):
-            log = Log(_time(log_ns), LEVELS[message.severity], message.text, message.vehicle, "", 0)
-            yield Record(LOG, log_ns, publish_ns, _encode(log))
+            log = Log(_time(message.t_ns), LEVELS[message.severity], message.text, message.vehicle, "", 0)
+            yield Record(LOG, publish_ns, _encode(log))
         elif isinstance(message, StateMessage) and message.state is not None:
             for topic, shown in self._shown(message.t_ns, message.state):
-                yield Record(topic, log_ns, publish_ns, _encode(shown))
+                yield Record(topic, publish_ns, _encode(shown))
 
     def _is_due(self, message: StateAtInstant) -> bool:
         turn = message.mode, message.resets, message.t_ns // self._period_ns
@@ -249,13 +261,17 @@ class Converter:
         if self._origin is None:
             self._origin = _Origin(LocalFrame.at(state, ENU_FLU), state)
         frame, origin = self._origin.frame, self._origin.state
+        local = frame.state(state)
+        w, x, y, z = local.quaternion_lb
+        position, attitude = Vector3(*local.position_l), Quaternion(x, y, z, w)
+        if not self._trail or math.dist(self._trail[-1], local.position_l) >= TRAIL_STEP_M:
+            self._trail.append(local.position_l)
         if self._origin_second != time.sec:  # once a second, for clients that connect later
             self._origin_second = time.sec
             fix = _fix(time, ROOT, origin, frame)
             yield ORIGIN, msgspec.structs.replace(fix, heading=0.0, velocity=Vector3(0.0, 0.0, 0.0))
-        local = frame.state(state)
-        w, x, y, z = local.quaternion_lb
-        position, attitude = Vector3(*local.position_l), Quaternion(x, y, z, w)
+            places = [Vector3(*(round(number, 2) for number in place)) for place in (*self._trail, local.position_l)]
+            yield TRAIL, PosesInFrame(time, ROOT, [PoseOf(place, Quaternion(0.0, 0.0, 0.0, 1.0)) for place in places])
         yield TRANSFORM, FrameTransform(time, ROOT, BODY, position, attitude)
         yield POSE, PoseInFrame(time, ROOT, PoseOf(position, attitude))
         yield LOCATION, _fix(time, BODY, state, frame)

@@ -19,6 +19,7 @@ from fusiond_adapters.foxglove.converter import (
     POSE,
     ROOT,
     TOPICS,
+    TRAIL,
     innovations_topic,
     judged_sources,
 )
@@ -26,11 +27,13 @@ from fusiond_adapters.foxglove.converter import (
 STATE = TOPICS[StateMessage]
 AXES = ("north", "east", "down")
 
+STRIP_PERCENT = 20  # of the height: two strips of 64 pixels with axis and title are 190, on a screen of 1080
+
 Panel = dict[str, Any]
 
 
 def layout(config: Config) -> Panel:
-    """The layout: map and 3-D view on the left, plots on the right, events and raw health below."""
+    """The layout: modes over the whole width; map and 3-D view on the left, plots on the right; events and health below."""
     panels = {
         "map!place": _map(),
         "3D!scene": _scene(),
@@ -40,19 +43,19 @@ def layout(config: Config) -> Panel:
         "Plot!ratios": _plot("Test ratios: 1 is the gate", [
             (f"{innovations_topic(source)}.test_ratio", source) for source in judged_sources(config)
         ]),
-        "RosOut!events": {"searchTerms": [], "minLogLevel": 1, "topicToRender": LOG},
-        "RawMessages!health": {"topicPath": TOPICS[HealthMessage], "diffEnabled": False},
+        "RosOut!events": _titled("Events", {"searchTerms": [], "minLogLevel": 1, "topicToRender": LOG}),
+        "RawMessages!health": _titled("Health", {"topicPath": TOPICS[HealthMessage], "diffEnabled": False}),
     }  # fmt: skip
-    left = _split("column", "map!place", "3D!scene", 55)
-    plots = _split("column", "Plot!sigmas", "Plot!ratios", 50)
-    right = _split("column", _split("column", "StateTransitions!mode", "Plot!speed", 25), plots, 45)
+    left = _split("column", "map!place", "3D!scene", 50)
+    right = _split("column", "Plot!speed", _split("column", "Plot!sigmas", "Plot!ratios", 50), 33)
     below = _split("row", "RosOut!events", "RawMessages!health", 50)
+    views = _split("column", _split("row", left, right, 45), below, 78)
     return {
         "configById": panels,
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": _split("column", _split("row", left, right, 45), below, 75),
+        "layout": _split("column", "StateTransitions!mode", views, STRIP_PERCENT),
     }
 
 
@@ -60,33 +63,41 @@ def _split(direction: str, first: str | Panel, second: str | Panel, percentage: 
     return {"direction": direction, "first": first, "second": second, "splitPercentage": percentage}
 
 
+def _titled(title: str, panel: Panel) -> Panel:
+    """A panel with a title: each of the two programs has a key of its own for it."""
+    return {"foxglovePanelTitle": title, "lichtblickPanelTitle": title, **panel}
+
+
 def _map() -> Panel:
-    return {
-        "foxglovePanelTitle": "Position",
+    panel = {
         "layer": "map",
         "followTopic": LOCATION,
         "disabledTopics": [ORIGIN],
         "topicColors": {},
         "zoomLevel": 17,
     }
+    return _titled("Position", panel)
 
 
 def _scene() -> Panel:
     grid = {"instanceId": "grid", "layerId": "foxglove.Grid", "visible": True, "frameId": ROOT, "size": 200, "divisions": 20}
-    return {
-        "foxglovePanelTitle": "Attitude",
+    panel = {
         "followMode": "follow-position",
         "followTf": BODY,
         "cameraState": {"perspective": True, "distance": 30, "phi": 60, "thetaOffset": 45, "target": [0, 0, 0]},
         "scene": {"transforms": {"axisScale": 2, "showLabel": True}},
-        "topics": {POSE: {"visible": True, "type": "axis", "axisScale": 3}},
+        "topics": {
+            POSE: {"visible": True, "type": "axis", "axisScale": 3},
+            TRAIL: {"visible": True, "type": "line", "lineWidth": 0.4, "gradient": ["#50c87840", "#50c878ff"]},
+        },
         "layers": {"grid": grid},
     }
+    return _titled("Attitude and trail", panel)
 
 
 def _transitions() -> Panel:
     paths = [(f"{STATE}.mode", "mode"), (f"{STATE}.resets", "resets")]
-    return {"foxglovePanelTitle": "Mode and resets", "isSynced": True, "paths": _paths(paths)}
+    return _titled("Mode and resets", {"isSynced": True, "paths": _paths(paths)})
 
 
 def _sigmas() -> list[tuple[str, str]]:
@@ -96,8 +107,7 @@ def _sigmas() -> list[tuple[str, str]]:
 
 
 def _plot(title: str, paths: Iterable[tuple[str, str]]) -> Panel:
-    return {
-        "foxglovePanelTitle": title,
+    panel = {
         "paths": _paths(paths),
         "showXAxisLabels": True,
         "showYAxisLabels": True,
@@ -107,6 +117,7 @@ def _plot(title: str, paths: Iterable[tuple[str, str]]) -> Panel:
         "isSynced": True,
         "xAxisVal": "timestamp",
     }
+    return _titled(title, panel)
 
 
 def _paths(paths: Iterable[tuple[str, str]]) -> list[Panel]:

@@ -101,7 +101,7 @@ class FoxgloveServer:
                     if topic is None:
                         self.unknown += 1
                         continue
-                    topic.log(record.data, log_time=record.log_ns)
+                    topic.log(record.data, log_time=record.publish_ns)
                     self.sent += 1
         for one in topics.values():
             one.close()

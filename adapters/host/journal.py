@@ -1,4 +1,4 @@
-"""Logging: under systemd in the journal's own protocol, with fields; otherwise as lines on stderr.
+"""Logging: under systemd in the journal's own protocol, with fields; otherwise as lines on stderr, with times.
 
 A record's `extra` gives fields: FUSIOND_SOURCE (the source, input or output concerned), FUSIOND_MODE, MESSAGE_ID (the
 kind of event, for `journalctl MESSAGE_ID=...`). Repeats are counted instead of logged; the next record after REPEAT_S gives
@@ -128,9 +128,11 @@ def is_journal(stream: TextIO) -> bool:
 
 
 def set_up(level: int = logging.INFO) -> None:
-    """Log to the journal if stderr goes there, otherwise to stderr."""
+    """Log to the journal, which has times of its own, if stderr goes there; otherwise to stderr, with the time in UTC."""
     handler: logging.Handler = JournalHandler() if is_journal(sys.stderr) else logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+    lines = logging.Formatter("%(asctime)s.%(msecs)03dZ %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S")
+    lines.converter = time.gmtime
+    handler.setFormatter(lines)
     handler.addFilter(Repeats())
     logging.basicConfig(level=level, handlers=[handler], force=True)
     logging.getLogger("can").setLevel(logging.CRITICAL)  # python-can logs a missing bus and raises it too

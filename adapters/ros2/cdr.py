@@ -87,8 +87,15 @@ class OdometryTemplate(Template):
         super().__init__(_make(ODOMETRY, _header(frame), child, pose, _twist()), 7 + 36 + 6 + 36)
 
     def filled(self, t_ns: int, state: LocalState, rate_variance: Triple) -> bytes:
+        """The body in the local frame."""
         pose = six(state.covariance_position_l, state.covariance_attitude_l)
-        numbers = (*state.position_l, *xyzw(state.quaternion_lb), *pose, *twist(state, rate_variance))
+        return self.placed(t_ns, Placed(state.position_l, state.quaternion_lb), pose, state, rate_variance)
+
+    def placed(
+        self, t_ns: int, body: Placed, covariance: Sequence[float], state: LocalState, rate_variance: Triple
+    ) -> bytes:
+        """The body where it is in any frame, with the covariance (6, 6) of its pose."""
+        numbers = (*body.position, *xyzw(body.quaternion), *covariance, *twist(state, rate_variance))
         return self.packed(t_ns, numbers)
 
 

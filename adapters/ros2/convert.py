@@ -7,8 +7,17 @@ from collections.abc import Iterator
 
 from fusiond.config.outputs import Ros2
 from fusiond.estimator.solution import Mode
-from fusiond.messages.local_frame import LocalFrame, OdometryFrame
-from fusiond.messages.types import HealthMessage, InputHealth, OutputHealth, SourceHealth, State, StateMessage
+from fusiond.messages.drift import Drift
+from fusiond.messages.local_frame import LocalFrame, LocalState, OdometryFrame, Placed
+from fusiond.messages.types import (
+    HealthMessage,
+    InputHealth,
+    OutputHealth,
+    SourceHealth,
+    State,
+    StateMessage,
+    Triple,
+)
 from fusiond.units import SECOND
 from fusiond_adapters.ros2 import cdr
 from fusiond_adapters.ros2.cdr import ERROR, OK, WARN, Status
@@ -18,6 +27,7 @@ LEVELS = {Mode.NOMINAL: OK, Mode.DEAD_RECKONING: WARN, Mode.ALIGNING: WARN, Mode
 RESET_SHOWN_NS = 5 * SECOND  # how long the diagnostics warn of a reset
 KINDS = {  # by topic
     "odometry": cdr.ODOMETRY,
+    "odometry/local": cdr.ODOMETRY,
     "fix": cdr.FIX,
     "twist": cdr.TWIST,
     "/tf": cdr.TF,
@@ -36,9 +46,13 @@ class Converter:
             latitude, longitude, height = section.origin
             self._frame = LocalFrame(math.radians(latitude), math.radians(longitude), height)
         self._odometry_frame = OdometryFrame()
+        self._drift = Drift()
+        self._speed = 0.0  # m/s, of the last state
+        self._sent_ns = 0  # its stamp
         self._period_ns = SECOND / section.rate_hz
         self._slot = 0
         self._odometry = cdr.OdometryTemplate(section.map_frame, section.base_frame)
+        self._local_odometry = cdr.OdometryTemplate(section.odom_frame, section.base_frame)
         self._twist = cdr.TwistTemplate(section.base_frame)
         self._fixes = {
             Mode.NOMINAL: cdr.FixTemplate(section.base_frame, cdr.STATUS_FIX),
@@ -71,13 +85,28 @@ class Converter:
             self._frame = LocalFrame.at(state)
         local = self._frame.state(state)
         rate_variance = _squared(state)
+        odom, body = self._follow(message, local, state.sigma_gyro_bias_rps)
         yield "odometry", self._odometry.filled(t_ns, local, rate_variance)
+        covariance = self._drift.covariance(local, body)
+        yield "odometry/local", self._local_odometry.placed(t_ns, body, covariance, local, rate_variance)
         if self._section.tf:
-            yield "/tf", self._transforms.filled(t_ns, self._odometry_frame.follow(t_ns, local))
+            yield "/tf", self._transforms.filled(t_ns, (odom, body))
         yield "twist", self._twist.filled(t_ns, local, rate_variance)
         position = (state.lat_deg, state.lon_deg, state.height_m)
         covariance = self._frame.covariance_axes(state.covariance_position_m2)
         yield "fix", self._fixes[message.mode].filled(t_ns, position, covariance)
+
+    def _follow(self, message: StateMessage, local: LocalState, sigma_gyro_bias: Triple) -> tuple[Placed, Placed]:
+        """The odometry frame in the map, the body in the odometry frame; and how far it may have drifted there."""
+        t_ns, speed = message.t_ns, math.hypot(*local.velocity_b)
+        blind = self._odometry_frame.loses_sight(t_ns, message.resets)
+        odom, body = self._odometry_frame.follow(t_ns, local, message.resets)
+        if blind:
+            self._drift.lose_sight(t_ns, max(speed, self._speed) * (t_ns - self._sent_ns) / SECOND)
+        else:
+            self._drift.follow(t_ns, local, body, sigma_gyro_bias)
+        self._speed, self._sent_ns = speed, t_ns
+        return odom, body
 
     def health(self, message: HealthMessage) -> Iterator[tuple[str, bytes]]:
         """Topic and CDR of the diagnostics."""

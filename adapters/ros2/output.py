@@ -18,6 +18,7 @@ from fusiond.config.toml import ConfigError
 from fusiond.messages.types import HealthMessage, Message, StateMessage
 from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.zenoh.session import PublishError, open_session
+from fusiond_adapters.zenoh.words import in_words
 
 try:
     from fusiond_adapters.ros2 import cdr
@@ -66,8 +67,10 @@ class Ros2Output:
             ):
                 self._publishers = {name: node.publisher(topic) for name, topic in topics(section)}
                 self._publish(session, stop)
-        except (PublishError, zenoh.ZError) as error:
+        except PublishError as error:
             raise OutputLost(str(error)) from error
+        except zenoh.ZError as error:
+            raise OutputLost(f"zenoh: {in_words(error)}") from error
 
     def counts(self) -> dict[str, int]:
         """Messages sent, and states without a usable state."""

@@ -8,6 +8,7 @@ order, and Zenoh waits for its readers.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from threading import Event
@@ -19,10 +20,12 @@ from fusiond.messages.types import MESSAGES, HealthMessage, InnovationMessage, M
 from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.zenoh.queries import Answers
 from fusiond_adapters.zenoh.session import LAST_SAMPLE_S, PublishError, ZenohPublisher, open_session
+from fusiond_adapters.zenoh.words import in_words
 
 QUEUE_MESSAGES = 1024  # a second of everything, and more
 READER_S = 0.002  # time of a slow reader for a message, at the end of a replay: see _linger
 MIN_LINGER_S, MAX_LINGER_S = LAST_SAMPLE_S + 0.2, 5.0  # Zenoh's queues have some thousands of messages
+KINDS = ("router", "peer", "client")  # zenoh.WhatAmI, as text
 
 
 class ZenohOutput:
@@ -54,7 +57,7 @@ class ZenohOutput:
         except PublishError as error:
             raise OutputLost(str(error)) from error
         except zenoh.ZError as error:
-            raise OutputLost(f"zenoh: {error}") from error
+            raise OutputLost(f"zenoh: {in_words(error)}") from error
         finally:
             self.outbox.at_once = None
             self._notes = {"session": "closed"}
@@ -84,9 +87,10 @@ class ZenohOutput:
         time.sleep(min(longest_s, max(MIN_LINGER_S, self._read_s - time.monotonic())))
 
     def _update_notes(self, session: zenoh.Session) -> None:
-        """Count the peers of the session. This may wait for Zenoh, so the estimator's thread must not do it."""
-        routers, peers = len(session.info.routers_zid()), len(session.info.peers_zid())
-        self._notes = {"session": f"{routers} routers, {peers} peers connected"}
+        """Count who is connected, clients too. This may wait for Zenoh, so the estimator's thread must not do it."""
+        kinds = Counter(str(transport.whatami) for transport in session.info.transports())
+        connected = [_counted(kinds[kind], kind) for kind in KINDS]
+        self._notes = {"session": f"{', '.join(connected)} connected"}
 
     def _send(self, publisher: ZenohPublisher, message: Message) -> None:
         publisher.publish(message)
@@ -113,8 +117,12 @@ class ZenohOutput:
         return {"sent": self.sent, "stale": self.stale, "sessions": self.sessions, "answered": self.answers.answered}
 
     def notes(self) -> dict[str, str]:
-        """The number of routers and peers connected."""
+        """The number of routers, peers and clients connected."""
         return self._notes
+
+
+def _counted(number: int, kind: str) -> str:
+    return f"{number} {kind}{'' if number == 1 else 's'}"
 
 
 def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:

@@ -8,7 +8,6 @@ waits a millisecond at most. Streams (state, settled, innovations) lose samples 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from fusiond.config.outputs import Zenoh as ZenohSection
 from fusiond.messages.codec import encode
 from fusiond.messages.keys import key as key_of
 from fusiond.messages.types import MESSAGES, InnovationMessage, Message
+from fusiond_adapters.zenoh.words import endpoint, in_words
 
 STREAMS = ("state", "settled", "innovations")
 PRIORITY = {"state": zenoh.Priority.REAL_TIME, "settled": zenoh.Priority.REAL_TIME, "innovations": zenoh.Priority.DATA}
@@ -63,9 +63,15 @@ def open_session(section: ZenohSection, directory: str | Path = ".", *, patient:
     If the queue of a reader is full, publishing waits PATIENCE_US before it drops the sample; only if `patient`.
     """
     config = session_config(section, directory, patient=patient)
-    what = f"zenoh: cannot open a {section.mode}, listen {section.listen}, connect {section.connect}"
-    with _explained(what):
+    with _explained(f"zenoh: cannot {_aim(section)}"):
         return zenoh.open(config)
+
+
+def _aim(section: ZenohSection) -> str:
+    """What a session is to do, in words."""
+    connect = [f"connect to {' or '.join(section.connect)}"] if section.connect else []
+    listen = [f"listen on {' and '.join(section.listen)}"] if section.listen and section.mode != "client" else []
+    return ", or ".join(listen + connect) or f"open a {section.mode}"
 
 
 def session_config(section: ZenohSection, directory: str | Path = ".", *, patient: bool = True) -> zenoh.Config:
@@ -77,8 +83,8 @@ def session_config(section: ZenohSection, directory: str | Path = ".", *, patien
     defaults, default = zenoh.Config(), ZenohSection()
     for key, value, usual in (
         ("mode", section.mode, default.mode),
-        ("listen/endpoints", section.listen, default.listen),
-        ("connect/endpoints", section.connect, default.connect),
+        ("listen/endpoints", [endpoint(one) for one in section.listen], default.listen),
+        ("connect/endpoints", [endpoint(one) for one in section.connect], default.connect),
         ("scouting/multicast/enabled", section.multicast_scouting, default.multicast_scouting),
         ("scouting/gossip/enabled", False, False),
         ("connect/retry", RETRY, RETRY),
@@ -88,7 +94,7 @@ def session_config(section: ZenohSection, directory: str | Path = ".", *, patien
         (WAIT, PATIENCE_US if patient else 0, PATIENCE_US),
     ):
         if value != usual or config.get_json(key) == defaults.get_json(key):
-            with _explained(f"zenoh: {key} cannot be {value!r}"):
+            with _explained(f"zenoh: {key.replace('/', '.')} cannot be {value}"):
                 config.insert_json5(key, json.dumps(value))
     return config
 
@@ -100,12 +106,11 @@ def _from_file(path: Path) -> zenoh.Config:
 
 @contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Convert Zenoh's error into a PublishError: what was tried, and the reason without locations in Zenoh's source."""
+    """Convert Zenoh's error into a PublishError: what was tried, and why it failed."""
     try:
         yield
     except zenoh.ZError as error:
-        reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error)).strip()
-        raise PublishError(f"{what}: {reason}") from error
+        raise PublishError(f"{what}: {in_words(error)}") from error
 
 
 class ZenohPublisher:

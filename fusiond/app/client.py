@@ -43,7 +43,8 @@ class ClientError(Exception):
 class Client:
     """A connection to the fusiond of one vehicle (or of all: `vehicle="*"`), directly or through a router.
 
-    `config_file` is Zenoh's own configuration file, such as for TLS. Raises ClientError if the endpoint cannot be reached.
+    `endpoint` is HOST, HOST:PORT, or one of Zenoh's such as tls/HOST:PORT. `config_file` is Zenoh's own configuration file,
+    such as for TLS. Raises ClientError if the endpoint cannot be reached.
     """
 
     def __init__(

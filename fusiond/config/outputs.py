@@ -35,7 +35,7 @@ class Zenoh(Section, frozen=True, kw_only=True):
 
     mode: Literal["peer", "client", "router"] = "peer"  # a client needs a router, a peer does not
     listen: list[str] = field(default_factory=lambda: ["tcp/127.0.0.1:7447"])  # endpoints to listen on
-    connect: list[str] = field(default_factory=list)  # endpoints to connect to
+    connect: list[str] = field(default_factory=list)  # endpoints to connect to: HOST:PORT, or such as tls/HOST:PORT
     multicast_scouting: bool = False  # discovery on the local network
     config_file: str | None = None  # Zenoh's own configuration file, read before the keys above
 

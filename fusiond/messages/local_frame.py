@@ -105,7 +105,8 @@ class OdometryFrame:
     """Keeps the odometry frame: the filter's velocity and turn rate, integrated from one state to the next.
 
     Roll and pitch are the filter's own, which gravity keeps from drifting; position and heading are free of its corrections.
-    During a gap the frame does not move in the local one.
+    In a gap without a reset the frame does not move in the local one, so the body moves as the filter says. In a gap with a
+    reset nothing is known of the motion, and the body stays where it was in the odometry frame.
     """
 
     def __init__(self) -> None:
@@ -113,11 +114,20 @@ class OdometryFrame:
         self._turn = 0.0  # rad, of the local frame in the odometry frame, about the vertical
         self._shift_l = (0.0, 0.0, 0.0)  # m, of the odometry frame's origin in the local frame
         self._last: tuple[int, LocalState] | None = None
+        self._resets = 0
 
-    def follow(self, t_ns: int, state: LocalState) -> tuple[Placed, Placed]:
+    def loses_sight(self, t_ns: int, resets: int) -> bool:
+        """Whether a state that follows now comes after a gap with a reset; `resets` counts the resets so far."""
+        return self._last is not None and t_ns - self._last[0] > MAX_GAP_NS and resets != self._resets
+
+    def follow(self, t_ns: int, state: LocalState, resets: int = 0) -> tuple[Placed, Placed]:
         """The odometry frame in the local one, and the body in the odometry frame. Stamps must increase."""
-        last, self._last = self._last, (t_ns, state)
-        if last is not None and 0 < t_ns - last[0] <= MAX_GAP_NS:
+        last, blind = self._last, self.loses_sight(t_ns, resets)
+        self._last, self._resets = (t_ns, state), resets
+        if last is not None and blind:
+            self._turn -= _correction(last[1], state, 0.0)
+            self._shift_l = _less(state.position_l, _about_vertical(-self._turn, self._position_o))
+        elif last is not None and 0 < t_ns - last[0] <= MAX_GAP_NS:
             dt = (t_ns - last[0]) / SECOND
             step = _about_vertical(self._turn, _scaled(_sum(last[1].velocity_l, state.velocity_l), dt / 2))
             self._position_o = _sum(self._position_o, step)

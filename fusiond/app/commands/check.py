@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from fusiond.app.kernel import slow_kernel
 from fusiond.config import load as config
 from fusiond.config.explain import description, oddities
 from fusiond_adapters.can.decoder import CanDecoder
@@ -24,7 +25,8 @@ def run(arguments: argparse.Namespace) -> None:
     decoders = [CanDecoder(loaded, bus) for bus in loaded.can]
     for line in description(loaded):
         print(line)
-    odd = [*oddities(loaded), *(warning for decoder in decoders for warning in decoder.warnings)]
+    slow = slow_kernel()
+    odd = [*oddities(loaded), *([slow] if slow else []), *(warning for decoder in decoders for warning in decoder.warnings)]
     for line in odd:
         print(f"warning: {line}")
     print(f"{arguments.config}: can be used" + (f", with {len(odd)} warning(s)" if odd else ""))

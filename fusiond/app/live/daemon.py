@@ -15,9 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Event, current_thread
 from typing import Any
 
+from fusiond.app.kernel import slow_kernel
 from fusiond.app.live.estimator_thread import Estimator
 from fusiond.app.live.inputs import Inputs
 from fusiond.app.live.live_engine import LiveEngine
+from fusiond.app.live.quiet import Quiet
 from fusiond.app.outputs import Outputs
 from fusiond.app.state_file import StateFile
 from fusiond.config.changes import changes
@@ -81,6 +83,7 @@ class Daemon:
         self.up = asyncio.Event()  # every input is prepared, and every output has been tried
         self.health: HealthMessage | None = None  # the latest
         self.estimator = Estimator(self.live, self.inputs, self.clock, self._wake, self._after_step)
+        self._quiet = Quiet(self.inputs, self.live.engine.health, self._publish, self.clock.now_ns)
         self._load, self._sinks = load, sinks
         self._stopping = Event()
         self._over = asyncio.Event()  # the estimator has ended
@@ -147,6 +150,8 @@ class Daemon:
         self._notifier.ready(self.status())
         parts = [one.about for one in self.inputs.values()] + [one.about for one in self.outputs.values()]
         log.info("up: %s", ", ".join(parts), extra={"MESSAGE_ID": journal.STARTED})
+        if slow := slow_kernel():
+            log.warning("%s", slow)
 
     # --- The estimator
 
@@ -180,6 +185,7 @@ class Daemon:
         if now_s >= self._next_report_s:
             self._next_report_s = now_s + REPORT_S
             self._report_losses()
+        self._quiet.after_step(self.health)
 
     # --- The stored state
 

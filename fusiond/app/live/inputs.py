@@ -24,6 +24,7 @@ class Inputs(Mapping[str, LiveInput[Any]]):
         self._over = Event()
         self._stops = {key: Event() for key in self._inputs}  # ends the present session of an input
         self._prepared = {key: Event() for key in self._inputs}
+        self.open: set[str] = set()  # those with a session now
         self._threads = [Thread(target=self._keep, args=(key,), name=key) for key in self._inputs]
 
     def __getitem__(self, key: str) -> LiveInput[Any]:
@@ -73,8 +74,13 @@ class Inputs(Mapping[str, LiveInput[Any]]):
 
         def session() -> None:
             stop = self._stops[key] = Event()
-            if not self._over.is_set():  # it may have been set before this event existed
+            if self._over.is_set():  # it may have been set before this event existed
+                return
+            self.open.add(key)
+            try:
                 one.session(stop)
+            finally:
+                self.open.discard(key)
 
         try:
             one.prepare()

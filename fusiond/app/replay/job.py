@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from fusiond.app.kernel import slow_kernel
 from fusiond.app.progress import shown
 from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.files import (
@@ -61,6 +62,8 @@ def replay(options: Options) -> Summary:
 
     Raises ConfigError, LogError, TruthError, UsageError, OutputError.
     """
+    if slow := slow_kernel():
+        print(f"warning: {slow}", file=sys.stderr)  # at once: a long replay takes hours then
     config, logs = options.config, open_logs(options.logs, options.config)
     pacer = Pacer(options.speed) if options.speed else None
     task = ReplayTask(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)

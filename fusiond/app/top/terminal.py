@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import shutil
 import sys
 import termios
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import TextIO
 
 from fusiond.app.client import Client, ClientError
-from fusiond.app.top.view import Colour, Line, View, plain, screen
+from fusiond.app.top.view import Colour, Line, Place, View, page, plain, screen
 from fusiond.messages.types import EventMessage, HealthMessage, Message, StateMessage
 from fusiond.ports.outputs import Outbox
 
@@ -23,9 +24,18 @@ MAX_WAITING = 1024  # messages
 REDRAW_S = 0.25
 FIRST_S = 5.0  # how long `once` waits for a state and a health message
 CODES: dict[Colour, str] = {"plain": "0", "dim": "2", "bold": "1", "green": "32", "yellow": "33", "red": "1;31"}
+COLOURLESS: dict[Colour, str] = {"plain": "0", "dim": "0", "bold": "1", "green": "0", "yellow": "1", "red": "7"}  # NO_COLOR
 ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # the alternate screen without a cursor, and back
 HOME, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
 QUIT = frozenset("qQ\x03\x04")
+KEYS = {  # what terminals send for a key, and its name
+    "\x1b[A": "up", "\x1bOA": "up", "k": "up", "\x1b[B": "down", "\x1bOB": "down", "j": "down",
+    "\x1b[C": "right", "\x1bOC": "right", "l": "right", "\x1b[D": "left", "\x1bOD": "left", "h": "left",
+    "\x1b[5~": "page up", "b": "page up", "\x1b[6~": "page down", " ": "page down",
+    "\x1b[H": "home", "\x1bOH": "home", "\x1b[1~": "home", "g": "home",
+    "\x1b[F": "end", "\x1bOF": "end", "\x1b[4~": "end", "G": "end", "\t": "tab",
+}  # fmt: skip
+KEY = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Za-z]|[^\x1b]")
 
 
 class Watch:
@@ -44,6 +54,13 @@ class Watch:
             self.view.add(message)
             if isinstance(message, StateMessage):
                 self._last = self._clock()
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is all that a screen shows, without the events. While nothing is heard there is no state."""
+        health = self.view.health
+        waits = health is not None and bool(health.inputs) and not any(one.received for one in health.inputs.values())
+        return health is not None and (self.view.state is not None or waits)
 
     @property
     def silent_s(self) -> float:
@@ -72,37 +89,52 @@ def choose(client: Client) -> str:
 
 
 def once(watch: Watch, out: TextIO) -> None:
-    """Print one screen without colours. Raises ClientError if no state comes."""
+    """Print everything as text. Raises ClientError if nothing comes."""
     until = time.monotonic() + FIRST_S
-    while (watch.view.state is None or watch.view.health is None) and time.monotonic() < until:
+    while not watch.complete and time.monotonic() < until:
         watch.update(REDRAW_S)
-    if watch.view.state is None:
-        raise ClientError(f"no state for {FIRST_S:g} s")
-    width, height = shutil.get_terminal_size((200, 100))
-    for line in screen(watch.view, watch.silent_s, width, max(height, 100)):
+    if watch.view.state is None and watch.view.health is None:
+        raise ClientError(f"neither a state nor a health message for {FIRST_S:g} s")
+    width, _ = shutil.get_terminal_size((200, 100))
+    for line in screen(watch.view, watch.silent_s, width):
         out.write(plain(line) + "\n")
 
 
-def live(watch: Watch, keys: TextIO, out: TextIO) -> None:
-    """Redraw until `q` is pressed."""
+def live(watch: Watch, keys: TextIO, out: TextIO, codes: Mapping[Colour, str] = CODES) -> None:
+    """Redraw until `q` is pressed; other keys choose what is shown."""
+    place, pressed = Place(), list[str]()
     with _raw(keys), _screen(out):
-        while not _pressed(keys) & QUIT:
+        while not QUIT.intersection(pressed):
             width, height = shutil.get_terminal_size()
-            lines = screen(watch.view, watch.silent_s, width, height - 1)
-            out.write(HOME + "".join(ansi(line) + REST_OF_LINE + "\n" for line in lines) + REST_OF_SCREEN)
+            for key in pressed:
+                place.press(KEYS.get(key, key), max(1, height - 3))
+            lines = page(watch.view, watch.silent_s, width, height, place)
+            out.write(HOME + "\n".join(ansi(line, codes) + REST_OF_LINE for line in lines) + REST_OF_SCREEN)
             out.flush()
             watch.update(0)
             select.select([keys], [], [], REDRAW_S)
+            pressed = _pressed(keys)
 
 
-def ansi(line: Line) -> str:
+def ansi(line: Line, codes: Mapping[Colour, str] = CODES) -> str:
     """A line with the terminal's codes for its colours."""
-    return "".join(f"\x1b[{CODES[span.colour]}m{span.text}\x1b[0m" for span in line)
+    return "".join(f"\x1b[{codes[span.colour]}m{span.text}\x1b[0m" for span in line)
 
 
-def _pressed(keys: TextIO) -> set[str]:
+def _pressed(keys: TextIO) -> list[str]:
+    """The keys pressed, as the terminal sent them; `q` when it has gone."""
     ready, _, _ = select.select([keys], [], [], 0)
-    return set(os.read(keys.fileno(), 64).decode("ascii", "replace") or "q") if ready else set()
+    return KEY.findall(os.read(keys.fileno(), 64).decode("ascii", "replace") or "q") if ready else []
+
+
+def can_redraw(terminal: str | None) -> bool:
+    """Whether a terminal of this kind ($TERM) can place a cursor."""
+    return terminal not in (None, "", "dumb")
+
+
+def codes_for(no_color: str | None) -> Mapping[Colour, str]:
+    """The codes to use with this value of $NO_COLOR: any but the empty one turns colours off (no-color.org)."""
+    return COLOURLESS if no_color else CODES
 
 
 @contextmanager
@@ -131,8 +163,9 @@ def run(endpoint: str, vehicle: str | None, config_file: str | None, *, just_onc
     if vehicle is None:
         with Client(endpoint, "*", config_file=config_file) as client:
             vehicle = choose(client)
+    interactive = sys.stdin.isatty() and sys.stdout.isatty() and can_redraw(os.environ.get("TERM"))
     with Client(endpoint, vehicle, config_file=config_file) as client, Watch(client) as watch:
-        if just_once or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        if just_once or not interactive:
             once(watch, sys.stdout)
         else:
-            live(watch, sys.stdin, sys.stdout)
+            live(watch, sys.stdin, sys.stdout, codes_for(os.environ.get("NO_COLOR")))

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import islice
+from textwrap import wrap
 from typing import Literal, NamedTuple
 
 from fusiond.estimator.solution import Mode
@@ -24,7 +27,8 @@ from fusiond.messages.types import (
 from fusiond.units import MILLISECOND, SECOND
 
 SILENT_S = 2.0  # a longer time without a state is shown
-EVENTS = 12  # shown
+EVENTS = 100  # kept
+FEW_EVENTS = 12  # shown beside everything else
 STATES = 100  # over which the rate of the states is measured
 
 Colour = Literal["plain", "dim", "bold", "green", "yellow", "red"]
@@ -37,6 +41,9 @@ OUTCOMES = {  # column headings by field
     "waiting": "waiting",
 }  # fmt: skip
 BAD_OUTCOMES = frozenset({"rejected", "too_old", "invalid"})
+PARTS = ("all", "state", "sources", "in/out", "events")  # what can be shown, by the keys 1, 2, ...
+INDENT, LEAST_TEXT = 4, 20  # columns: of a text that continues below its line, and the narrowest such text
+SIDEWAYS = 16  # columns that a key scrolls
 
 
 class Span(NamedTuple):
@@ -77,12 +84,52 @@ class View:
         return (len(stamps) - 1) * SECOND / span_ns if span_ns > 0 else None
 
 
-def screen(view: View, silent_s: float, width: int, height: int) -> list[Line]:
-    """At most `height` lines of at most `width` columns; `silent_s` is the time since the last state."""
-    lines = list(_lines(view, silent_s))
-    if len(lines) > height:
-        lines = [*lines[: height - 1], (Span(f"... {len(lines) - height + 1} lines more", "dim"),)]
-    return [tuple(_cut(line, width)) for line in lines]
+@dataclass
+class Place:
+    """What of the screen a terminal shows: a part, and how far it is scrolled."""
+
+    part: int = 0  # of PARTS
+    top: int = 0  # lines above the terminal
+    left: int = 0  # columns left of it
+
+    def press(self, key: str, page: int) -> None:
+        """Move by a key's name; `page` is the number of lines that are scrolled."""
+        if key.isdigit() and 1 <= int(key) <= len(PARTS):
+            self.part, self.top, self.left = int(key) - 1, 0, 0
+        elif key == "tab":
+            self.part, self.top, self.left = (self.part + 1) % len(PARTS), 0, 0
+        elif key in ("left", "right"):
+            self.left = max(0, self.left + (SIDEWAYS if key == "right" else -SIDEWAYS))
+        else:
+            far = {"up": -1, "down": 1, "page up": -page, "page down": page, "home": -self.top, "end": self.top + 10**6}
+            self.top = max(0, self.top + far.get(key, 0))
+
+
+def screen(view: View, silent_s: float, width: int, part: str = PARTS[0]) -> list[Line]:
+    """All lines of a part; `silent_s` is the time since the last state. A text that is too long for the width goes on
+    below, but numbers do not."""
+    return [_printable(line) for line in (_title(view, silent_s), *_lines(view, width, part))]
+
+
+def page(view: View, silent_s: float, width: int, height: int, place: Place) -> list[Line]:
+    """What a terminal of this size shows: the first line, what fits of the others, and the keys. `place` is kept inside."""
+    title, *lines = screen(view, silent_s, width, PARTS[place.part])
+    room = max(0, height - 2)
+    place.top = min(place.top, max(0, len(lines) - room))
+    place.left = min(place.left, max(0, max(map(_length, lines), default=0) - width))
+    shown = [_from_column(line, place.left) for line in lines[place.top : place.top + room]]
+    shown += [()] * (room - len(shown))
+    below = _keys(place, len(lines), room)
+    return [_cut(line, width) for line in (title, *shown, below)[: max(1, height)]]
+
+
+def _keys(place: Place, lines: int, room: int) -> Line:
+    """The last line: the parts with their keys, and where in the lines the terminal is."""
+    parts = [Span(f"{number} {part}  ", "bold" if number == place.part + 1 else "dim")
+             for number, part in enumerate(PARTS, 1)]  # fmt: skip
+    last = min(lines, place.top + room)
+    where = f"arrows: {place.top + 1}-{last} of {lines} lines" if lines > room else "arrows"
+    return (*parts, Span("q quit  ", "dim"), Span(where, "bold" if last < lines else "dim"))
 
 
 def plain(line: Line) -> str:
@@ -90,42 +137,101 @@ def plain(line: Line) -> str:
     return "".join(span.text for span in line).rstrip()
 
 
-def _cut(line: Line, width: int) -> Iterator[Span]:
+def _length(line: Line) -> int:
+    return sum(len(span.text) for span in line)
+
+
+def _printable(line: Line) -> Line:
+    """A line without control characters: no text of a message may control the terminal."""
+    return tuple(
+        Span("".join(letter if letter.isprintable() else "?" for letter in span.text), span.colour) for span in line
+    )
+
+
+def _cut(line: Line, width: int) -> Line:
+    cut = []
     for span in line:
-        if width <= 0:
-            return
-        text = "".join(character if character.isprintable() else "?" for character in span.text[:width])
-        yield Span(text, span.colour)  # no text of a message may control the terminal
+        cut.append(Span(span.text[: max(0, width)], span.colour))
         width -= len(span.text)
+    return tuple(span for span in cut if span.text)
 
 
-def _lines(view: View, silent_s: float) -> Iterator[Line]:
-    if view.state is None:
-        yield (Span("no state yet", "yellow"),)
-    else:
-        yield from _state(view.state, view.rate_hz, silent_s)
+def _from_column(line: Line, column: int) -> Line:
+    rest = []
+    for span in line:
+        rest.append(Span(span.text[max(0, column) :], span.colour))
+        column -= len(span.text)
+    return tuple(span for span in rest if span.text)
+
+
+def _title(view: View, silent_s: float) -> Line:
+    if view.state is not None:
+        return tuple(_first(view.state, view.rate_hz, silent_s))
+    if view.health is None:
+        return (Span("no state yet", "yellow"),)
+    heard = any(one.received for one in view.health.inputs.values())
+    return Span(f"{view.health.vehicle}  ", "bold"), Span("no state yet" if heard else "nothing heard yet", "yellow")
+
+
+def _lines(view: View, width: int, part: str) -> Iterator[Line]:
+    """Below the first line."""
+    everything = part == PARTS[0]
+    if everything or part == "state":
+        if view.state is not None:
+            yield from _state(view.state)
+        if view.health is not None:
+            yield from _running(view.health)
     if view.health is not None:
-        yield from _health(view.health, view.before)
-    if view.events:
-        yield ()
-        yield (Span("EVENTS", "bold"),)
-        for event in reversed(view.events):
-            yield (Span(f"{_clock(event.t_ns)}  ", "dim"), Span(event.text, SEVERITIES[event.severity]))
+        if everything or part == "sources":
+            yield from _spaced(_sources(view.health, view.before, width), everything)
+        if everything or part == "in/out":
+            yield from _spaced(_inputs(view.health, width), everything)
+            yield from _spaced(_outputs(view.health, width), bool(view.health.inputs))
+    if view.events and (everything or part == "events"):
+        yield from _spaced(_events(islice(reversed(view.events), FEW_EVENTS if everything else None), width), everything)
+
+
+def _spaced(lines: Iterable[Line], apart: bool) -> Iterator[Line]:
+    """Lines, if there are any below an empty one."""
+    for number, line in enumerate(lines):
+        if apart and not number:
+            yield ()
+        yield line
+
+
+def _events(events: Iterable[EventMessage], width: int) -> Iterator[Line]:
+    yield (Span("EVENTS", "bold"),)
+    for event in events:
+        yield from _folded((Span(f"{_clock(event.t_ns)}  ", "dim"),), Span(event.text, SEVERITIES[event.severity]), width)
+
+
+def _folded(line: Line, text: Span, width: int) -> Iterator[Line]:
+    """A line that ends with a text; where the text does not fit, it goes on below."""
+    if _length(line) + len(text.text.rstrip()) <= width:
+        yield (*line, text)
+        return
+    room = max(LEAST_TEXT, width - INDENT)
+    first, *rest = wrap(text.text, max(1, width - _length(line))) if width - _length(line) >= LEAST_TEXT else ["", text.text]
+    yield (*line, Span(first, text.colour))
+    yield from ((Span(" " * INDENT), Span(row, text.colour)) for row in wrap(" ".join(rest), room))
 
 
 # --- The state
 
 
-def _state(message: StateMessage, rate_hz: float | None, silent_s: float) -> Iterator[Line]:
+def _first(message: StateMessage, rate_hz: float | None, silent_s: float) -> Iterator[Span]:
     silent = silent_s >= SILENT_S
-    yield (
-        Span(f"{message.vehicle}  ", "bold"),
-        Span(message.mode.value.replace("_", " "), "dim" if silent else MODES[message.mode]),
-        Span(f"  {_clock(message.t_ns)} UTC", "dim"),
-        *([Span(f"  {rate_hz:.0f} Hz")] if rate_hz else []),
-        Span(f"  resets {message.resets}", "yellow" if message.resets else "plain"),
-        *([Span(f"  no state for {silent_s:.0f} s", "red")] if silent else []),
-    )
+    yield Span(f"{message.vehicle}  ", "bold")
+    yield Span(message.mode.value.replace("_", " "), "dim" if silent else MODES[message.mode])
+    if silent:
+        yield Span(f"  no state for {silent_s:.0f} s", "red")
+    yield Span(f"  {_clock(message.t_ns)} UTC", "dim")
+    if rate_hz:
+        yield Span(f"  {rate_hz:.0f} Hz")
+    yield Span(f"  resets {message.resets}", "yellow" if message.resets else "plain")
+
+
+def _state(message: StateMessage) -> Iterator[Line]:
     if message.fault:
         yield (Span(f"state withheld: {message.fault}", "red"),)
     if message.state is not None:
@@ -165,7 +271,7 @@ def _clock(t_ns: int) -> str:
 # --- The health
 
 
-def _health(health: HealthMessage, before: HealthMessage | None) -> Iterator[Line]:
+def _running(health: HealthMessage) -> Iterator[Line]:
     latency = health.latency_ms
     stages = [("fused", latency.fused), ("published", latency.published)]
     text = "  ".join(f"{name} {_quantiles(quantiles)}" for name, quantiles in stages if quantiles)
@@ -174,21 +280,32 @@ def _health(health: HealthMessage, before: HealthMessage | None) -> Iterator[Lin
     yield _pair("up", f"{_duration(health.uptime_s)}  fusiond {health.version}")
     if health.reset_reason:
         yield _pair("reset", health.reset_reason)
-    yield ()
+
+
+def _sources(health: HealthMessage, before: HealthMessage | None, width: int) -> Iterator[Line]:
     old = before.sources if before else {}
     rows = [_source(name, source, old.get(name)) for name, source in health.sources.items()]
-    yield from _table(("SOURCE", "rate Hz", "age ms", *OUTCOMES.values(), "ratio", "NIS", "jitter ms", ""), rows)
+    yield from _table(("SOURCE", "rate Hz", "age ms", *OUTCOMES.values(), "ratio", "NIS", "jitter ms", ""), rows, width)
+
+
+def _inputs(health: HealthMessage, width: int) -> Iterator[Line]:
     if health.inputs:
-        yield ()
-        inputs = [
-            (Span(name), Span(str(one.received)), _alarm(one.dropped), Span(_counts(one.counts), "dim"))
+        rows = [
+            (
+                Span(name),
+                Span(str(one.received), "plain" if one.received else "yellow"),
+                _alarm(one.dropped),
+                Span(_counts(one.counts) if one.received else "nothing heard yet", "dim" if one.received else "yellow"),
+            )
             for name, one in health.inputs.items()
         ]
-        yield from _table(("INPUT", "received", "dropped", ""), inputs)
+        yield from _table(("INPUT", "received", "dropped", ""), rows, width)
+
+
+def _outputs(health: HealthMessage, width: int) -> Iterator[Line]:
     if health.outputs:
-        yield ()
-        outputs = [_output(name, one) for name, one in health.outputs.items()]
-        yield from _table(("OUTPUT", "offered", "dropped", "p50 p99 max ms", ""), outputs)
+        rows = [_output(name, one) for name, one in health.outputs.items()]
+        yield from _table(("OUTPUT", "offered", "dropped", "p50 p99 max ms", ""), rows, width)
 
 
 def _source(name: str, source: SourceHealth, before: SourceHealth | None) -> Sequence[Span]:
@@ -245,15 +362,15 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}"
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[Span]]) -> Iterator[Line]:
-    """Columns of minimum width: the first and the last aligned left, numbers right."""
-    rows = list(rows)
-    last = len(heads) - 1
+def _table(heads: Sequence[str], rows: Iterable[Sequence[Span]], width: int) -> Iterator[Line]:
+    """Columns of minimum width: the first aligned left, numbers right; the last is text, which may go on below."""
+    rows, last = list(rows), len(heads) - 1
     widths = [max(map(len, (head, *(row[i].text for row in rows)))) for i, head in enumerate(heads)]
 
     def aligned(i: int, text: str) -> str:
-        return text.ljust(widths[i]) if i in (0, last) else text.rjust(widths[i])
+        return (text.ljust(widths[i]) if i == 0 else text.rjust(widths[i])) + "  "
 
-    yield tuple(Span(aligned(i, head) + "  ", "bold") for i, head in enumerate(heads))
+    yield tuple(Span(aligned(i, head), "bold") for i, head in enumerate(heads[:last]))
     for row in rows:
-        yield tuple(Span(aligned(i, span.text) + "  ", span.colour) for i, span in enumerate(row))
+        numbers = tuple(Span(aligned(i, span.text), span.colour) for i, span in enumerate(row[:last]))
+        yield from _folded(numbers, row[last], width)

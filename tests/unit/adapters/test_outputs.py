@@ -290,7 +290,7 @@ def test_a_router_that_dies_and_comes_back(tmp_path: Path, channel: str, bus: ca
     router = open_session(section)
     try:
         with driven(tmp_path, channel, [collector], more, zenoh=True) as (run, drive_until):
-            drive_until(lambda: aligned(run) and zenoh_note(run).startswith("1 routers"))
+            drive_until(lambda: aligned(run) and zenoh_note(run).startswith("1 router,"))
             with Client(endpoint, "test") as client, client.subscribed(StateMessage, heard.append):
                 drive_until(lambda: len(heard) > 10)
                 router.close()

@@ -139,3 +139,18 @@ def test_in_a_gap_the_odometry_frame_does_not_move() -> None:
     after, body = frame.follow(*driven(resumed, shift=5.0))
     assert after == odom
     assert_allclose(joined(after, body)[0], driven(resumed, shift=5.0)[1].position_l, atol=1e-9)
+
+
+def test_after_a_gap_with_a_reset_the_body_is_where_it_was_in_the_odometry_frame() -> None:
+    frame = OdometryFrame()
+    for number in range(10):
+        _, before = frame.follow(*driven(number))
+    t_ns, local = driven(10 + MAX_GAP_NS // STEP_NS, shift=80.0, turned=1.0)
+    assert frame.loses_sight(t_ns, 1) and not frame.loses_sight(t_ns, 0)
+    odom, body = frame.follow(t_ns, local, 1)
+    assert_allclose(body.position, before.position, atol=1e-9)
+    assert heading(body) == pytest.approx(heading(before), abs=1e-9)
+    position, mat = joined(odom, body)
+    assert_allclose(position, local.position_l, atol=1e-9)
+    assert_allclose(mat, matrix(np.array(local.quaternion_lb)), atol=1e-12)
+    assert not frame.loses_sight(t_ns + 2 * MAX_GAP_NS, 1)  # the reset is known by then

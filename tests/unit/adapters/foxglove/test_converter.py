@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from fusiond.messages.types import EventMessage, HealthMessage, State, StateMessage
-from fusiond_adapters.foxglove.converter import FOXGLOVE, POSE, TOPICS, Converter, channels
+from fusiond_adapters.foxglove.converter import FOXGLOVE, POSE, TOPICS, TRAIL, TRAIL_POINTS, Converter, channels
 from tests.helpers.drive import messages, settings
 from tests.helpers.foxglove import PLAIN, fields, states
 
@@ -64,6 +64,7 @@ def test_foxgloves_own_types_take_what_is_written() -> None:
     made |= dict.fromkeys(("position", "translation", "velocity"), lambda value: sdk.Vector3(**value))
     made |= dict.fromkeys(("orientation", "rotation"), lambda value: sdk.Quaternion(**value))
     made |= {"pose": lambda value: sdk.Pose(**converted(value))}
+    made |= {"poses": lambda values: [sdk.Pose(**converted(value)) for value in values]}
     made |= {"level": lambda value: [sdk.LogLevel.Info, sdk.LogLevel.Warning, sdk.LogLevel.Error][value - 2]}
     made |= {"position_covariance_type": {3: sdk.LocationFixPositionCovarianceType.Known}.__getitem__}
 
@@ -104,6 +105,21 @@ def test_far_from_the_origin_up_is_not_the_origins_up() -> None:
     x, y, z, w = (far["orientation"][axis] for axis in "xyzw")
     forward_z = 2 * (x * z - w * y)  # of the body's forward axis
     assert forward_z == pytest.approx(-math.sin(math.radians(0.9)), rel=1e-6)
+
+
+def test_the_trail_is_where_the_body_was() -> None:
+    """At 10 m/s to the north: each second all points of the last 600 m, 2 m apart, and the present one."""
+    first, converter = placed(states()[-1], lat_deg=48.0, lon_deg=11.0, height_m=500.0), Converter()
+    trails: list[list[float]] = []
+    for number in range(4000):
+        state = msgspec.structs.replace(placed(first, lat_deg=48.0 + math.degrees(number * 0.2 / 6.367e6)),
+                                        t_ns=first.t_ns + number * 20_000_000)  # fmt: skip
+        found = shown(converter, state).get(TRAIL)
+        if found is not None:
+            trails.append([pose["position"]["y"] for pose in found["poses"]])
+    assert len(trails) == pytest.approx(80, abs=1)  # in 80 s
+    assert len(trails[10]) == pytest.approx(5 * 10, abs=6) and len(trails[-1]) == TRAIL_POINTS + 1
+    assert trails[-1] == sorted(trails[-1]) and trails[-1][-2] - trails[-1][0] == pytest.approx(2.0 * 299, rel=0.15)
 
 
 def test_no_state_no_pose() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fusiond_adapters.foxglove import layout as foxglove_layout
-from fusiond_adapters.foxglove.converter import channels
+from fusiond_adapters.foxglove.converter import TRAIL, channels
 from tests.helpers.foxglove import PLAIN, fields
 from tests.helpers.paths import ROOT
 
@@ -44,6 +44,22 @@ def test_the_documented_layout_fits_the_demo_and_its_paths_exist() -> None:
     ratios = {path["value"] for path in layout["configById"]["Plot!ratios"]["paths"]}
     sources = [source.replace(".", "/") for source in car.sources() if source != "imu0"]
     assert ratios == {f"/fusiond/innovations/{source}.test_ratio" for source in sources}
+
+
+def test_every_panel_has_a_title_and_the_modes_have_room() -> None:
+    from fusiond.app.demo import demo  # noqa: PLC0415
+    from fusiond.config import load as config  # noqa: PLC0415
+
+    made = foxglove_layout.layout(config.load(demo.DRIVE / "fusiond.toml"))
+    titles = [panel["foxglovePanelTitle"] for panel in made["configById"].values()]
+    assert all(titles) and len(set(titles)) == len(titles)
+    assert titles == [panel["lichtblickPanelTitle"] for panel in made["configById"].values()]  # its key since the fork
+    strip, whole = made["configById"]["StateTransitions!mode"], made["layout"]
+    assert (whole["direction"], whole["first"]) == ("column", "StateTransitions!mode")  # over the whole width
+    pixels = 64 * len(strip["paths"]) + 30 + 30  # a strip for each path, the axis, the title
+    assert whole["splitPercentage"] / 100 * 950 >= pixels
+    trail = made["configById"]["3D!scene"]["topics"][TRAIL]
+    assert trail["visible"] and trail["type"] == "line"
 
 
 def test_the_layout_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

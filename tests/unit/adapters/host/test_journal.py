@@ -103,6 +103,24 @@ def test_what_repeats_remembers_is_bounded() -> None:
     assert len(repeats._logged) == journal.MAX_KEPT
 
 
+def test_lines_outside_the_journal_begin_with_the_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    root, packets = logging.getLogger(), logging.getLogger("can")
+    before, level, of_packets = root.handlers[:], root.level, packets.level
+    try:
+        journal.set_up()
+        record = logging.makeLogRecord({"msg": "gps0 is back", "levelno": logging.INFO, "levelname": "INFO"})
+        record.created, record.msecs = 1_767_225_600.0425, 42.0  # 2026-01-01
+        root.handle(record)
+    finally:
+        root.handlers[:] = before
+        root.setLevel(level)
+        packets.setLevel(of_packets)
+    assert capsys.readouterr().err == "2026-01-01T00:00:00.042Z INFO gps0 is back\n"
+
+
 def test_the_journal_is_distinguished_from_other_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (tmp_path / "stderr").open("w") as stream:
         status = os.fstat(stream.fileno())

@@ -47,7 +47,7 @@ def test_tokens_and_keys_are_the_sdks(namespace: str) -> None:
     node = NodeEntity(42, ZID, 0, "fusiond", namespace)
     assert wire.node_token(42, ZID, 0, namespace, "fusiond") == node_liveliness_keyexpr(node)
     found = list(topics(Ros2(namespace=namespace)))
-    assert [name for name, _ in found] == ["odometry", "fix", "twist", "/tf", "/diagnostics"]
+    assert [name for name, _ in found] == ["odometry", "odometry/local", "fix", "twist", "/tf", "/diagnostics"]
     for entity, (name, topic) in enumerate(found, 1):
         prefix = "" if namespace == "/" or name.startswith("/") else namespace
         assert topic.name == f"{prefix}/{name.strip('/')}"

@@ -11,6 +11,7 @@ from fusiond.messages.types import EventMessage
 from fusiond_adapters.zenoh.output import ZenohOutput
 from tests.helpers.estimates import random_messages as states
 from tests.helpers.network import DEADLINE
+from tests.helpers.ros2 import health
 from tests.helpers.zenoh import endpoint, event, publishing, settings
 
 
@@ -44,3 +45,16 @@ def test_a_state_is_sent_in_the_thread_that_puts_it() -> None:
             assert output.outbox.waiting == 0
         assert output.sent == before + 2
         assert client.state_at(published[1].t_ns) == published[1]
+
+
+def test_clients_are_counted_among_those_connected() -> None:
+    where = endpoint()
+    with publishing(settings(where)) as output, Client(where, "rover"), Client(where, "rover") as client:
+        heard = client.stream(EventMessage, DEADLINE)
+        for text in ("one", "two"):
+            output.outbox.put(event(text))
+            assert next(heard) == event(text)
+            output.outbox.put(health())  # makes the output count
+        output.outbox.put(event("three"))
+        assert next(heard) == event("three")
+        assert output.notes() == {"session": "0 routers, 0 peers, 2 clients connected"}

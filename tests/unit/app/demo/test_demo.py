@@ -69,4 +69,4 @@ def test_it_is_published_for_top(port: int, tmp_path: Path, capsys: pytest.Captu
 def test_a_port_in_use_is_reported_at_once(port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", port)):
         assert main(["demo", "--publish", "--out", str(tmp_path / "out")]) == UNUSABLE
-    assert "zenoh: cannot open" in capsys.readouterr().err
+    assert "zenoh: cannot listen on" in capsys.readouterr().err

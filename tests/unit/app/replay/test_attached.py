@@ -157,7 +157,7 @@ def test_an_output_that_cannot_be_opened_ends_it_at_once(tmp_path: Path, capsys:
     with socket.create_server(("127.0.0.1", 0)) as squatter:
         file = configured(tmp_path, f'\n[zenoh]\nlisten = ["tcp/127.0.0.1:{squatter.getsockname()[1]}"]\n')
         assert replay(file, "--publish") == UNUSABLE
-    assert "zenoh: cannot open" in capsys.readouterr().err
+    assert "zenoh: cannot listen on" in capsys.readouterr().err
 
 
 def test_every_configured_output_can_be_attached(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
