@@ -118,9 +118,10 @@ class MavlinkLink:
         """Counts of frames and of the link so far."""
         own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
         requests = {f"asked for {name}": wanted.requests for name, wanted in self.housekeeping.wanted.items()}
+        denials = {f"denied {name}": wanted.denials for name, wanted in self.housekeeping.wanted.items() if wanted.denials}
         rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.housekeeping.wanted.items()}
         signing = self.housekeeping.signing.counts if self.housekeeping.signing else {}
-        return {**own, "reboots": self.housekeeping.reboots, **requests, **rates, **signing, **self.decoder.counts}
+        return {**own, "reboots": self.housekeeping.reboots, **requests, **denials, **rates, **signing, **self.decoder.counts}
 
 
 def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:
