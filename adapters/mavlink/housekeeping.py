@@ -22,7 +22,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common
 
 from fusiond.config.schema import Config
-from fusiond.units import SECOND
+from fusiond.units import MILLISECOND, SECOND
 from fusiond_adapters.mavlink.decoder import (
     HEADER_1,
     HEADER_2,
@@ -52,8 +52,9 @@ SYSTEM_TIME_HZ = 1.0
 STATUS_HZ = 1.0
 STATUS_OF = {"ardupilot": "EKF_STATUS_REPORT", "px4": "ESTIMATOR_STATUS"}  # an autopilot's reports on its estimator
 STATUS_IDS = {"EKF_STATUS_REPORT": 193, "ESTIMATOR_STATUS": 230}  # the first is not in the dialect `common`
-TIMESYNC_NS = SECOND  # between two TIMESYNC requests
-TIMESYNC_FIRST, TIMESYNC_FIRST_NS = 20, SECOND // 10  # number and interval of the first ones, also after a reboot
+OFF_BEAT_NS = 3 * MILLISECOND  # by which TIMESYNC requests miss the beat of the autopilot's loop, so that each waits differently
+TIMESYNC_NS = SECOND + OFF_BEAT_NS  # between two of them
+TIMESYNC_FIRST, TIMESYNC_FIRST_NS = 20, SECOND // 10 + OFF_BEAT_NS  # number and interval of the first, also after a reboot
 
 
 @dataclass(slots=True)
@@ -171,6 +172,11 @@ class Housekeeping:
                         frames.append(self._request(name, wanted, t_ns))
                         break
         return frames
+
+    def wait_ns(self, t_ns: int) -> int:
+        """How long a request for the autopilot's time can wait."""
+        waits = self._sends_timesync and self.target is not None
+        return max(0, self._next_timesync_ns - t_ns) if waits else SECOND
 
     def _is_to_us(self, fields: dict[str, Any]) -> bool:
         """Whether a message is addressed to fusiond, or to all."""

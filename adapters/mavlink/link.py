@@ -12,6 +12,7 @@ from fusiond.config.toml import ConfigError
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputContext, InputLost, LiveInput
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.decoder import FrameSplitter, MavlinkDecoder, message_id
 from fusiond_adapters.mavlink.housekeeping import Housekeeping
 from fusiond_adapters.mavlink.tlog_record import tlog_record
@@ -88,7 +89,8 @@ class MavlinkLink:
         splitter = FrameSplitter(self.decoder.dialect)
         skipped_before = self.skipped_bytes
         while not stop.is_set():
-            chunks = transport.read(POLL_S)
+            wait_s = self.housekeeping.wait_ns(self._clock.now_ns()) / SECOND  # a request that waited for data comes on the beat
+            chunks = transport.read(min(POLL_S, wait_s))
             t_ns = self._clock.now_ns()
             for chunk in chunks:
                 for frame in splitter.feed(chunk):
