@@ -52,7 +52,7 @@ SYSTEM_TIME_HZ = 1.0
 STATUS_HZ = 1.0
 STATUS_OF = {"ardupilot": "EKF_STATUS_REPORT", "px4": "ESTIMATOR_STATUS"}  # an autopilot's reports on its estimator
 STATUS_IDS = {"EKF_STATUS_REPORT": 193, "ESTIMATOR_STATUS": 230}  # the first is not in the dialect `common`
-OFF_BEAT_NS = 3 * MILLISECOND  # by which TIMESYNC requests miss the beat of the autopilot's loop, so that each waits differently
+OFF_BEAT_NS = 3 * MILLISECOND  # TIMESYNC requests miss the beat of the autopilot's loop by this: each waits differently
 TIMESYNC_NS = SECOND + OFF_BEAT_NS  # between two of them
 TIMESYNC_FIRST, TIMESYNC_FIRST_NS = 20, SECOND // 10 + OFF_BEAT_NS  # number and interval of the first, also after a reboot
 
@@ -228,12 +228,13 @@ class Housekeeping:
         wanted = self.wanted[name]
         if result == common.MAV_RESULT_ACCEPTED:
             if wanted.refused is not None and wanted.requested_hz < wanted.rate_hz:
-                hint = f"; {wanted.hint}" if wanted.hint else ""
-                self.changes.append(f"{name} is denied at {wanted.rate_hz:.3g} Hz, given at {wanted.requested_hz:.3g} Hz{hint}")
+                found = f"{name} is denied at {wanted.rate_hz:.3g} Hz, given at {wanted.requested_hz:.3g} Hz"
+                self.changes.append(f"{found}; {wanted.hint}" if wanted.hint else found)
             wanted.refused = None
             return
         results = common.enums["MAV_RESULT"]
-        wanted.refused = results[result].name.removeprefix("MAV_RESULT_").lower() if result in results else f"result {result}"
+        named = result in results
+        wanted.refused = results[result].name.removeprefix("MAV_RESULT_").lower() if named else f"result {result}"
         if result == common.MAV_RESULT_DENIED:
             wanted.denials += 1
             if wanted.interval_us < LONGEST_PERIODS_US:

@@ -89,7 +89,7 @@ class MavlinkLink:
         splitter = FrameSplitter(self.decoder.dialect)
         skipped_before = self.skipped_bytes
         while not stop.is_set():
-            wait_s = self.housekeeping.wait_ns(self._clock.now_ns()) / SECOND  # a request that waited for data comes on the beat
+            wait_s = self.housekeeping.wait_ns(self._clock.now_ns()) / SECOND  # a request does not wait for data
             chunks = transport.read(min(POLL_S, wait_s))
             t_ns = self._clock.now_ns()
             for chunk in chunks:
@@ -119,11 +119,13 @@ class MavlinkLink:
     def counts(self) -> dict[str, int]:
         """Counts of frames and of the link so far."""
         own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent}
-        requests = {f"asked for {name}": wanted.requests for name, wanted in self.housekeeping.wanted.items()}
-        denials = {f"denied {name}": wanted.denials for name, wanted in self.housekeeping.wanted.items() if wanted.denials}
-        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.housekeeping.wanted.items()}
+        asked = self.housekeeping.wanted.items()
+        requests = {f"asked for {name}": wanted.requests for name, wanted in asked}
+        denials = {f"denied {name}": wanted.denials for name, wanted in asked if wanted.denials}
+        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in asked}
         signing = self.housekeeping.signing.counts if self.housekeeping.signing else {}
-        return {**own, "reboots": self.housekeeping.reboots, **requests, **denials, **rates, **signing, **self.decoder.counts}
+        own["reboots"] = self.housekeeping.reboots
+        return {**own, **requests, **denials, **rates, **signing, **self.decoder.counts}
 
 
 def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:

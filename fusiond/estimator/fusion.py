@@ -157,9 +157,9 @@ class Fusion:
         return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
 
     def health(self, t_ns: int) -> dict[str, Belief]:
-        """The health of each source at an instant (docs/theory.md, D1 and D2). Until the filter runs, only a source that never
-        came is absent."""
-        head, came = self.history.head, self.history.counts.any(axis=1)
+        """The health of each source at an instant (docs/theory.md, D1 and D2). Until the filter runs, only a source that
+        never came is absent."""
+        head, came = self.history.head, self.history.counts.sum(axis=1) > 0
         start = int(head.stamps[T_START])
         first = t_ns if self._first_ns is None else self._first_ns
         return {

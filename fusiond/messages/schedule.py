@@ -187,8 +187,8 @@ class Sources:
 
 
 class Changes:
-    """Changes from one tick to the next: mode, resets, sources that appear, disappear or change their status, clocks that are
-    of no use, and of use again."""
+    """Changes from one tick to the next: mode, resets, sources that appear, disappear or change their status, clocks that
+    are of no use, and of use again."""
 
     def __init__(self, config: Config, fusion: Fusion) -> None:
         self.reset_reason: str | None = None

@@ -1,4 +1,4 @@
-"""A stand-in for ArduPilot Rover with the parameters that it comes with, on a simulated drive, in the time of the simulation.
+"""A stand-in for ArduPilot Rover with the parameters that it comes with, on a simulated drive and in its time.
 
 What it does as the autopilot does: everything happens in its loop (SCHED_LOOP_RATE 50 Hz), so that a request waits for the
 next turn, and a message is sent in a turn. An interval of less than 1.25 periods of the loop, in whole milliseconds, is
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -171,10 +171,11 @@ class Rehearsal:
         self._rover = rover
         self._sources = frozenset(config.streams())
 
-    def run(self, start_ns: int, stop_ns: int, others: Iterator[Received] = iter(())) -> None:
+    def run(self, start_ns: int, stop_ns: int, others: Iterable[Received] = ()) -> None:
         """Let the time pass; `others` are events of other inputs, in their order of receipt."""
         arriving: list[tuple[int, bytes]] = []
-        waiting = next(others, None)
+        rest = iter(others)
+        waiting = next(rest, None)
         for t_ns in range(start_ns, stop_ns, self._rover.period_ns):
             for arrival in self._rover.turn(t_ns):
                 heapq.heappush(arriving, arrival)
@@ -184,7 +185,7 @@ class Rehearsal:
                 while waiting is not None and waiting.t_receive_ns < now_ns:
                     if waiting.source in self._sources:
                         self.engine.feed(waiting)
-                    waiting = next(others, None)
+                    waiting = next(rest, None)
                 for frame in self.housekeeping.due(now_ns, alive=True):
                     self._rover.receive(frame, now_ns + WIRE_NS)
         self.engine.finish()
