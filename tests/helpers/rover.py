@@ -34,6 +34,7 @@ COMPONENT = 1
 WIRE_NS = MILLISECOND // 2  # from one to the other
 ANSWER_NS = 7 * MILLISECOND  # from the begin of a turn until what it sends leaves, but for sensors
 STEP_NS = 4 * MILLISECOND  # between two looks of fusiond at what it has to send
+MILLI_G = 9.80665e-3  # m/s^2
 OWN_HZ = {"HEARTBEAT": 1.0, "WHEEL_DISTANCE": 1.0}  # what comes without a request: SRn_EXTRA3 is 1 Hz
 Frames = Iterator[tuple[int, bytes]]  # time of arrival [ns], frame
 
@@ -141,6 +142,12 @@ class StockRover:
         row = self._row(t_ns)
         values = *self._force[row].tolist(), *self._rate[row].tolist()
         return common.MAVLink_highres_imu_message(self._boot_us(t_ns), *values, *(0.0,) * 7, 0x3F, 0)
+
+    def _scaled_imu(self, t_ns: int) -> Any:
+        row = self._row(t_ns)
+        force, rate = self._force[row] / MILLI_G, self._rate[row] * 1e3
+        counts = *np.rint(force).astype(int).tolist(), *np.rint(rate).astype(int).tolist()
+        return common.MAVLink_scaled_imu_message(self._boot_us(t_ns) // 1000, *counts, 0, 0, 0)
 
     def _gps_raw_int(self, t_ns: int) -> Any:
         """The newest fix, stamped with its arrival in whole milliseconds; none if it has been sent."""
