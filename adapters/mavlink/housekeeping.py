@@ -52,9 +52,10 @@ SYSTEM_TIME_HZ = 1.0
 STATUS_HZ = 1.0
 STATUS_OF = {"ardupilot": "EKF_STATUS_REPORT", "px4": "ESTIMATOR_STATUS"}  # an autopilot's reports on its estimator
 STATUS_IDS = {"EKF_STATUS_REPORT": 193, "ESTIMATOR_STATUS": 230}  # the first is not in the dialect `common`
-OFF_BEAT_NS = 3 * MILLISECOND  # TIMESYNC requests miss the beat of the autopilot's loop by this: each waits differently
-TIMESYNC_NS = SECOND + OFF_BEAT_NS  # between two of them
-TIMESYNC_FIRST, TIMESYNC_FIRST_NS = 20, SECOND // 10 + OFF_BEAT_NS  # number and interval of the first, also after a reboot
+TIMESYNC_NS = SECOND  # between two TIMESYNC requests, in the mean
+TIMESYNC_FIRST, TIMESYNC_FIRST_NS = 20, SECOND // 10  # number and interval of the first ones, also after a reboot
+BEAT_NS = 20 * MILLISECOND  # of the slowest loop of ArduPilot
+GOLDEN_NS = 12_360_680  # the golden ratio of it: each request comes at another instant of the loop, and waits differently
 
 
 @dataclass(slots=True)
@@ -205,7 +206,9 @@ class Housekeeping:
     def _timesync_request(self, t_ns: int) -> bytes:
         """A request whose answer the decoder recognises by its mark; it is stamped with the time of packing, within 1 us."""
         assert self.target is not None
-        self._next_timesync_ns = t_ns + (TIMESYNC_FIRST_NS if self._timesync_count < TIMESYNC_FIRST else TIMESYNC_NS)
+        number = self._timesync_count
+        off_beat_ns = (number + 1) * GOLDEN_NS % BEAT_NS - number * GOLDEN_NS % BEAT_NS
+        self._next_timesync_ns = t_ns + (TIMESYNC_FIRST_NS if number < TIMESYNC_FIRST else TIMESYNC_NS) + off_beat_ns
         self._timesync_count += 1
         sent_ns = t_ns // TIMESYNC_STEP * TIMESYNC_STEP + TIMESYNC_MARK
         return self.pack(Timesync(0, sent_ns, *self.target))

@@ -176,8 +176,8 @@ class WheelHandler:
     An encoder's stamp may be that of its last pulse (ArduPilot). It does not change while the wheel stands still: then the
     receive stamps give the elapsed time. The first message, and an immediate repeat of one, give no event.
 
-    The speed at the middle of an interval T differs from the mean by jerk T^2 / 24 (the mean of t^2/2 over the interval): that
-    is part of the reading's sigma, next to nothing at 10 Hz, and 0.08 m/s at the 1 Hz of a stock ArduPilot.
+    The speed at the middle of an interval T differs from the mean by jerk T^2 / 24 (the mean of t^2/2 over the interval):
+    that is part of the reading's sigma, next to nothing at 10 Hz, and 0.08 m/s at the 1 Hz of a stock ArduPilot.
     """
 
     fields = ("time_usec", "count", "distance")

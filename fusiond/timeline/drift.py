@@ -8,7 +8,7 @@ from itertools import pairwise
 from fusiond.timeline.least_offset import BILLION, MAX_DRIFT
 from fusiond.units import SECOND
 
-BUCKET = SECOND
+BUCKET = 9 * SECOND // 10  # a little less than the spacing of round trips
 AGREEING = 10  # consecutive lowest points that each lie lower, or higher, than the one before by more than LIMIT allows
 LIMIT = MAX_DRIFT + 500_000  # ppb: of a crystal, while NTP slews the host's clock (adjtimex does it by at most 500 ppm)
 STRIDES = (1, 10)  # buckets to one such point: quick for large drifts, and slow for small ones
@@ -19,7 +19,7 @@ class DriftWatch:
     """Judges points (x, y) = (receipt, receipt less stamp) [ns], or other offsets that latency only ever increases.
 
     The lowest points of consecutive spans of time move with the clock's drift, and up and down with the latency. No latency
-    makes them fall steadily below all before them; nor does a queue that fills make them rise steadily by more than RISE.
+    makes them fall steadily below all before them. A queue that fills makes them rise, but not for long by more than RISE.
     """
 
     def __init__(self) -> None:
@@ -50,5 +50,5 @@ class DriftWatch:
         rates = [(b[1] - a[1]) * BILLION // (b[0] - a[0]) for a, b in pairwise(points)]
         (x0, y0), (x1, y1) = points[0], points[-1]
         falls = max(rates) < -LIMIT and all(y >= y0 for _, y in lowest[:-count])
-        rises = min(rates) > LIMIT and y1 - y0 > RISE
+        rises = stride == STRIDES[-1] and min(rates) > LIMIT and y1 - y0 > RISE
         return (y1 - y0) * BILLION // (x1 - x0) if falls or rises else None

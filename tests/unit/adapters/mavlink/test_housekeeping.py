@@ -187,18 +187,22 @@ def test_timesync_is_frequent_at_first_and_after_a_reboot(settings: Config) -> N
     housekeeping, autopilot = Housekeeping(settings, "fc"), Autopilot()
     assert timesync_requests(housekeeping.due(0, alive=True)) == []  # no autopilot yet
     housekeeping.receive(autopilot.heartbeat(), 0)
-    step = SECOND // 1000
-    sent_at = [k * step for k in range(10_000) if timesync_requests(housekeeping.due(k * step, alive=True))]
-    assert sent_at[:20] == [k * 103 * step for k in range(20)]
-    assert {b - a for a, b in pairwise(sent_at[20:])} == {1003 * step}
-    assert len({at % (20 * step) for at in sent_at[:20]}) == 20  # each waits differently for a loop of 50 Hz
-    assert housekeeping.wait_ns(sent_at[-1] + 1000 * step) == 3 * step
-    (stamp,) = timesync_requests(housekeeping.due(11 * SECOND + 123_456, alive=True))
-    assert abs(stamp - (11 * SECOND + 123_456)) < 1000 and stamp % 1000 == 117
+    step, now, sent_at = SECOND // 1000, 0, []
+    while now < 12 * SECOND:
+        sent_at += [now] * len(timesync_requests(housekeeping.due(now, alive=True)))
+        now += max(1, housekeeping.wait_ns(now))
+    intervals = [(b - a) / SECOND for a, b in pairwise(sent_at)]
+    assert intervals[:20] == [pytest.approx(0.1, abs=0.013)] * 20
+    assert intervals[20:] == [pytest.approx(1.0, abs=0.013)] * 9
+    assert sum(intervals[:20]) == pytest.approx(2.0, abs=0.02)
+    phases = sorted(at % (20 * step) for at in sent_at[:20])  # each waits differently for a loop of 50 Hz
+    assert max(b - a for a, b in pairwise([*phases, phases[0] + 20 * step])) < 2 * step
+    (stamp,) = timesync_requests(housekeeping.due(13 * SECOND + 123_456, alive=True))
+    assert abs(stamp - (13 * SECOND + 123_456)) < 1000 and stamp % 1000 == 117
     for boot_ms in (10_000, 100):
-        housekeeping.receive(autopilot.system_time(boot_ms), 12 * SECOND)
+        housekeeping.receive(autopilot.system_time(boot_ms), 14 * SECOND)
     for later_ns in (1, 150 * step):
-        assert timesync_requests(housekeeping.due(12 * SECOND + later_ns, alive=True))
+        assert timesync_requests(housekeeping.due(14 * SECOND + later_ns, alive=True))
 
 
 @pytest.mark.parametrize(

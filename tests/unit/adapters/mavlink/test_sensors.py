@@ -23,6 +23,7 @@ from fusiond.events import (
 )
 from fusiond_adapters.mavlink.decoder import TIMESYNC_MARK, MavlinkDecoder
 from fusiond_adapters.mavlink.sensors import HANDLERS
+from fusiond_adapters.mavlink.timesync import Timesync
 
 BASE = '[mavlink.fc]\nsystem = 1\n[imu.imu0]\nlink = "fc"\n'
 YAW = BASE + '[dual_antenna.yaw0]\nlink = "fc"\n'
@@ -200,8 +201,8 @@ def test_answers_to_our_own_timesync_alone() -> None:
     vehicle = Vehicle(BASE)
     asked = (T0 + 5 * MS) // 1000 * 1000 + TIMESYNC_MARK
 
-    def answer(tc1: int, ts1: int, component: int = 1) -> list[Received]:
-        return vehicle.send(dialect.MAVLink_timesync_message(tc1, ts1), 7, component)
+    def answer(tc1: int, ts1: int, component: int = 1, to: tuple[int, int] = (0, 0)) -> list[Received]:
+        return vehicle.send(Timesync(tc1, ts1, *to), 7, component)
 
     assert answer(9_000_000_000, asked) == []  # whose clock? no autopilot has been heard yet
     vehicle.send(dialect.MAVLink_heartbeat_message(10, 3, 0, 0, 0, 3), 6)
@@ -211,6 +212,9 @@ def test_answers_to_our_own_timesync_alone() -> None:
     assert answer(0, asked) == []  # a question
     assert answer(9_000_000_000, asked + 1) == []  # an answer to someone else
     assert answer(9_000_000_000, asked, component=191) == []  # by another companion
+    assert len(answer(9_000_000_000, asked, to=(1, 191))) == 1
+    assert answer(9_000_000_000, asked, to=(1, 197)) == []  # to another companion that runs fusiond
+    assert answer(9_000_000_000, asked, to=(9, 191)) == []
 
 
 @pytest.mark.parametrize(
