@@ -28,6 +28,7 @@ EVENTS = {
     "source_lost": "d38d920ccaeb4f778624c5c13553fe82",
     "source_found": "91ee207d6dee4087af9ffdefed58eb49",
     "source_status": "c3ad48b0445f410481aeb313d68164ad",
+    "clock": "5f0c2b8e1d5e4a0a9d6b7a3c94f2e816",
 }
 CONNECTION_LOST = "6f76bece9cb8432588f2d5f2b9136fed"
 DATA_LOST = "f9c7bf04bb324984934cfddb280196f7"
@@ -37,8 +38,9 @@ RELOADED = "65be903f1e374e55a4416688a46ade1f"
 
 
 def about(kind: str, subject: str) -> dict[str, str]:
-    """The fields of a published event: its subject is the mode entered, or a source."""
-    named = {"FUSIOND_MODE": subject} if kind == "mode" else {"FUSIOND_SOURCE": subject} if subject else {}
+    """The fields of a published event: its subject is the mode entered, a clock or a source."""
+    field = {"mode": "FUSIOND_MODE", "clock": "FUSIOND_CLOCK"}.get(kind, "FUSIOND_SOURCE")
+    named = {field: subject} if subject else {}
     return {"MESSAGE_ID": EVENTS[kind], **named} if kind in EVENTS else named
 
 

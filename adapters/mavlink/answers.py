@@ -19,6 +19,7 @@ from fusiond_adapters.mavlink.outgoing import RateLimiter
 
 COMMANDS = (common.MAV_CMD_REQUEST_MESSAGE, common.MAV_CMD_SET_MESSAGE_INTERVAL, common.MAV_CMD_GET_MESSAGE_INTERVAL)
 STOP, DEFAULT = -1, 0  # intervals of MAV_CMD_SET_MESSAGE_INTERVAL; others are microseconds
+MAX_INTERVAL_US = 2**31 - 1  # what MESSAGE_INTERVAL can say
 BY_NAME = -1  # PARAM_REQUEST_READ.param_index
 CAPABILITIES = (
     common.MAV_PROTOCOL_CAPABILITY_MAVLINK2 | common.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -105,7 +106,7 @@ class Responder:
         if command == common.MAV_CMD_GET_MESSAGE_INTERVAL:
             interval = round(1e6 / limiter.rate_hz) if limiter.rate_hz else -1
             return common.MAV_RESULT_ACCEPTED, common.MAVLink_message_interval_message(number, interval)
-        if not (value in (STOP, DEFAULT) or value >= 1):
+        if not (value in (STOP, DEFAULT) or 1 <= value <= MAX_INTERVAL_US):
             return common.MAV_RESULT_DENIED, None
         limiter.rate_hz = 0.0 if value == STOP else self._default_hz[number] if value == DEFAULT else 1e6 / value
         return common.MAV_RESULT_ACCEPTED, None

@@ -35,6 +35,7 @@ from fusiond.events import (
 )
 from fusiond.units import MICROSECOND, MILLISECOND
 from fusiond_adapters.mavlink.sensors import HANDLERS
+from fusiond_adapters.mavlink.timesync import Timesync
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 MAGIC = re.compile(b"[\xfd\xfe]")
@@ -339,6 +340,7 @@ class MavlinkDecoder:
         except ConfigError as error:
             raise ConfigError(f"mavlink.{link}.dialect: {error}") from error
         self._component = settings.component
+        self._own_system, self._own_component = settings.own_system, settings.own_component
         self._autopilot = settings.component  # component that answers TIMESYNC; 0: not known yet
         self._sender = 0  # component of the present frame
         self._boot_clock = boot_clock(link, self.system)
@@ -415,12 +417,14 @@ class MavlinkDecoder:
         if SYSTEM_TIME in self.dialect.ids:
             handlers[SYSTEM_TIME] = [(("time_unix_usec", "time_boot_ms"), self._system_time_events)]
         if TIMESYNC in self.dialect.ids:
-            handlers[TIMESYNC] = [(("tc1", "ts1"), self._timesync_events)]
+            fields = ("tc1", "ts1", "target_system", "target_component")
+            handlers[TIMESYNC] = [(fields, self._timesync_events)]
         for _, name, section in config.sensors(link=self.link):
             handler = HANDLERS[type(section)](self, name, section, config)
             for message in section.messages():
                 handlers.setdefault(message, []).append((handler.fields, handler.events))
-        readers = {message: _Reader(self.dialect.type_of(message), found) for message, found in handlers.items()}
+        kinds = {message: Timesync if message == TIMESYNC else self.dialect.type_of(message) for message in handlers}
+        readers = {message: _Reader(kinds[message], found) for message, found in handlers.items()}
         self._heartbeat = readers[HEARTBEAT]
         return {self.dialect.ids[message]: reader for message, reader in readers.items()}
 
@@ -431,8 +435,10 @@ class MavlinkDecoder:
 
     def _timesync_events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         """The autopilot's answer to fusiond's request, recognised by its mark; the frame contains both stamps."""
-        remote_ns, sent_ns = fields
+        remote_ns, sent_ns, to_system, to_component = fields
         if remote_ns <= 0 or self._sender != self._autopilot or sent_ns % TIMESYNC_STEP != TIMESYNC_MARK:
+            return []
+        if to_system not in (0, self._own_system or self.system) or to_component not in (0, self._own_component):
             return []
         stamp = (self._boot_clock, remote_ns)
         return [self.event(f"{self.link}.timesync", stamp, t_receive_ns, ClockPair(HOST_CLOCK, sent_ns))]

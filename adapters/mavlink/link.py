@@ -14,6 +14,7 @@ from fusiond.config.toml import ConfigError
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputContext, InputLost, LiveInput
+from fusiond.units import SECOND
 from fusiond_adapters.mavlink.decoder import MavlinkDecoder, PeerSplitter, message_id
 from fusiond_adapters.mavlink.housekeeping import Housekeeping
 from fusiond_adapters.mavlink.signing import is_signed
@@ -112,7 +113,8 @@ class MavlinkLink:
 
     def _receive(self, transport: Transport, splitter: PeerSplitter) -> None:
         """Read what is there, after waiting for it, and pass on its frames."""
-        chunks = transport.read(POLL_S)
+        wait_s = self.housekeeping.wait_ns(self._clock.now_ns()) / SECOND  # a request does not wait for data
+        chunks = transport.read(min(POLL_S, wait_s))
         t_ns = self._clock.now_ns()
         for data, peer in chunks:
             valid = False
@@ -145,10 +147,13 @@ class MavlinkLink:
     def counts(self) -> dict[str, int]:
         """Counts of frames and of the link so far."""
         own = {"sessions": self.sessions, "garbage bytes": self.skipped_bytes, "sent": self.sent, **self._counts}
-        requests = {f"asked for {name}": wanted.requests for name, wanted in self.housekeeping.wanted.items()}
-        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in self.housekeeping.wanted.items()}
+        asked = self.housekeeping.wanted.items()
+        requests = {f"asked for {name}": wanted.requests for name, wanted in asked}
+        denials = {f"denied {name}": wanted.denials for name, wanted in asked if wanted.denials}
+        rates = {f"Hz of {name}": round(wanted.measured_hz or 0) for name, wanted in asked}
         signing = self.housekeeping.signing.counts if self.housekeeping.signing else {}
-        return {**own, "reboots": self.housekeeping.reboots, **requests, **rates, **signing, **self.decoder.counts}
+        own["reboots"] = self.housekeeping.reboots
+        return {**own, **requests, **denials, **rates, **signing, **self.decoder.counts}
 
 
 def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:

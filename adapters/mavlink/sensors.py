@@ -28,7 +28,8 @@ UNKNOWN_U16 = 65535
 NORTH = 36000  # centidegrees: a yaw of 0
 ACCEL_AND_GYRO = 0x3F  # HIGHRES_IMU.fields_updated
 MIN_INTERVAL_NS = 2 * MILLISECOND  # a message that repeats the previous one sooner than this is a copy of it
-MAX_INTERVAL_NS = SECOND  # the mean speed over a longer interval says little about the speed at its middle
+MAX_INTERVAL_NS = 2 * SECOND  # the middle of a longer interval is older than what is fused
+JERK = 2.0  # m/s^3, of a vehicle on wheels
 RESET_M = 1.0  # a counter that falls to exactly 0 from more than this has been reset
 PASCAL = 100.0  # in a hectopascal
 FREEZING = 273.15  # K
@@ -174,6 +175,9 @@ class WheelHandler:
 
     An encoder's stamp may be that of its last pulse (ArduPilot). It does not change while the wheel stands still: then the
     receive stamps give the elapsed time. The first message, and an immediate repeat of one, give no event.
+
+    The speed at the middle of an interval T differs from the mean by jerk T^2 / 24 (the mean of t^2/2 over the interval):
+    that is part of the reading's sigma, next to nothing at 10 Hz, and 0.08 m/s at the 1 Hz of a stock ArduPilot.
     """
 
     fields = ("time_usec", "count", "distance")
@@ -218,8 +222,8 @@ class WheelHandler:
             return Invalid("counter reset")
         if abs(speed) > self._fastest:
             return Invalid("counter jumped")
-        quantum = wheel.quantum_m * abs(wheel.scale)
-        return WheelSpeed(speed, quantum / math.sqrt(6) / seconds)  # two readings, each with quantum^2 / 12
+        quantum = wheel.quantum_m * abs(wheel.scale) / math.sqrt(6) / seconds  # two readings, each with quantum^2 / 12
+        return WheelSpeed(speed, math.hypot(quantum, JERK * seconds * seconds / 24))
 
 
 class PressureHandler:

@@ -85,6 +85,7 @@ class Fusion:
             for source, found in config.streams().items()
         }
         self.invalid: dict[str, Counter[str]] = {source: Counter() for source in self.params.sources}
+        self._first_ns: int | None = None  # receipt of the session's first measurement
 
     def feed(self, received: Received) -> Receipt | None:
         """Align an event and fuse it; begin a new session if its receipt steps back. None for an event that only informs the
@@ -99,6 +100,8 @@ class Fusion:
 
     def fuse(self, measurement: Measurement) -> Receipt:
         """Fuse an event that is already aligned. ValueError if its source is not configured."""
+        if self._first_ns is None:
+            self._first_ns = measurement.t_receive_ns
         history, source = self.history, self.history.index.get(measurement.source)
         if source is None:
             raise ValueError(f"no source '{measurement.source}' is configured: {', '.join(self.params.sources)}")
@@ -115,6 +118,7 @@ class Fusion:
         are kept."""
         self.clock.forget()
         self.history = self.history.next_session()
+        self._first_ns = None
 
     def solution_at(self, t_ns: int) -> Solution:
         """The solution at an instant, from everything received so far: the head, predicted to the instant with the newest
@@ -153,15 +157,17 @@ class Fusion:
         return {outcome.name: int(self.history.counts[:, outcome].sum()) for outcome in Outcome}
 
     def health(self, t_ns: int) -> dict[str, Belief]:
-        """The health of each source at an instant (docs/theory.md, D1 and D2)."""
-        head = self.history.head
+        """The health of each source at an instant (docs/theory.md, D1 and D2). Until the filter runs, only a source that
+        never came is absent."""
+        head, came = self.history.head, self.history.counts.sum(axis=1) > 0
         start = int(head.stamps[T_START])
+        first = t_ns if self._first_ns is None else self._first_ns
         return {
             source: belief(
                 head.memory[i],
                 head.source_stamps[i],
                 t_ns,
-                start if start != NEVER else t_ns,
+                start if start != NEVER else t_ns if came[i] else first,
                 probability_of_lie(head, i, self.params),
             )
             for i, source in enumerate(self.params.sources)

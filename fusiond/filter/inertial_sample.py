@@ -171,10 +171,18 @@ def doubt(
 
 @compiled
 def judge_sensor(state: FilterState, values: Vector, t_ns: int, params: Parameters) -> None:
-    """The health of the sensor as a source, by a sample: it is frozen if the sample repeats as a whole, or in one axis."""
-    memory = state.memory[params.imu_source]
-    same = judge_axes(state, values, params)
-    judge_repetition(memory, state.source_stamps[params.imu_source], same, t_ns)
+    """The health of the sensor as a source, by a sample: it is frozen if the sample repeats as a whole, or in one axis.
+
+    A whole sample that repeats says something only where the readings of late changed by more than a few quanta: a sensor
+    that is coarse for its noise, or whose readings an autopilot has filtered, repeats itself on a straight road."""
+    memory, a = state.memory[params.imu_source], state.auxiliary
+    same, fine = judge_axes(state, values, params), False
+    for kind in range(2):
+        change = a[CHANGE_FORCE] if kind == 0 else a[CHANGE_RATE]
+        if change >= 3 * square(STEPS * a[QUANTUM.start + kind]):
+            fine = True
+    if fine or not same:
+        judge_repetition(memory, state.source_stamps[params.imu_source], same, t_ns)
     if memory[FROZEN_PLACE] > 0:
         odds = 0.0
         for i in range(AXES):

@@ -187,7 +187,8 @@ class Sources:
 
 
 class Changes:
-    """Changes from one tick to the next: mode, resets, sources that appear, disappear or change their status."""
+    """Changes from one tick to the next: mode, resets, sources that appear, disappear or change their status, clocks that
+    are of no use, and of use again."""
 
     def __init__(self, config: Config, fusion: Fusion) -> None:
         self.reset_reason: str | None = None
@@ -195,7 +196,9 @@ class Changes:
         self._mode: Mode | None = None
         self._resets = 0
         self._present: frozenset[str] = frozenset()
+        self._awaited = set(fusion.params.sources)  # never present yet
         self._statuses = dict.fromkeys(fusion.params.sources, "nominal")
+        self._unusable: frozenset[str] = frozenset()
         self._next_status_ns: int = NEVER
 
     def begin_session(self) -> None:
@@ -223,14 +226,25 @@ class Changes:
             text = f"{source}: nothing received for {ABSENT_NS / SECOND:g} s"
             yield event(kind="source_lost", severity="warning", subject=source, text=text)
         self._present = present
+        self._awaited -= present
         if state.t_ns >= self._next_status_ns:
             self._next_status_ns = state.t_ns + STATUS_NS
             for source, health in self._fusion.health(state.t_ns).items():
-                if health.status not in ("absent", self._statuses[source]):  # source_lost reports an absent source
+                if health.status == "absent" and source in self._awaited:
+                    self._awaited.discard(source)
+                    yield event(kind="source_lost", severity="warning", subject=source, text=f"{source}: {health.reason}")
+                elif health.status not in ("absent", self._statuses[source]):  # source_lost reports an absent source
                     self._statuses[source] = health.status
                     good = health.status == "nominal"
                     text = f"{source}: {health.status}" + (f": {health.reason}" if health.reason else "")
                     yield event(kind="source_status", severity="info" if good else "warning", subject=source, text=text)
+            clocks = self._fusion.clock.report()
+            unusable = frozenset(name for name, report in clocks.items() if not report.usable)
+            for name in sorted(unusable - self._unusable):
+                yield event(kind="clock", severity="critical", subject=name, text=f"clock {name}: {clocks[name].note}")
+            for name in sorted(self._unusable - unusable):
+                yield event(kind="clock", severity="info", subject=name, text=f"clock {name}: of use again")
+            self._unusable = unusable
 
     def _reason(self) -> str:
         """The reason of the last reset, in words."""

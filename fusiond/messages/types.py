@@ -100,7 +100,7 @@ class SettledMessage(StateAtInstant, frozen=True, kw_only=True):
 
 OutcomeName = Literal["fused", "rejected", "too_old", "duplicate", "invalid", "waiting"]
 SourceStatus = Literal["nominal", "noisy", "biased", "frozen", "absent"]
-EventKind = Literal["mode", "reset", "source_lost", "source_found", "source_status"]
+EventKind = Literal["mode", "reset", "source_lost", "source_found", "source_status", "clock"]
 Severity = Literal["info", "notice", "warning", "critical"]
 
 
@@ -127,9 +127,9 @@ class EventMessage(Message, frozen=True, kw_only=True):
     schema: Annotated[int, _about("version of this message's layout")] = SCHEMA_VERSION
     vehicle: Annotated[str, _about("name of the vehicle")]
     t_ns: Annotated[int, _about("when it was detected [ns]")]
-    kind: Annotated[EventKind, _about("mode, reset, source_lost, source_found or source_status")]
+    kind: Annotated[EventKind, _about("mode, reset, source_lost, source_found, source_status or clock")]
     severity: Annotated[Severity, _about("info, notice, warning or critical")]
-    subject: Annotated[str, _about("the mode entered, or the source; empty for a reset")]
+    subject: Annotated[str, _about("the mode entered, the source or the clock; empty for a reset")]
     text: Annotated[str, _about("one line of text")]
 
 

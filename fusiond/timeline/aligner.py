@@ -7,10 +7,11 @@ unix           trusted as it is (aim 0) while receipt - stamp is plausible: -FUT
                TRUST_LOST_AFTER, and regained by a plausible re-alignment, or when the least offset creeps back. Without
                trust: least offset. A host ahead by less than PLAUSIBLE_LATENCY cannot be distinguished from a slow link.
 boot + trips   (TIMESYNC) from boot to the host's clock by round trips, see `RoundTrips`, while that is plausible against
-               the least offset. With pairs it also gives the host's offset from Unix time, which is then the aim of Unix
-               stamps, trusted or not: so stamps are right even if the host's clock is wrong.
+               the least offset and certain to STEP. With pairs it also gives the host's offset from Unix time, which is
+               then the aim of Unix stamps, trusted or not: so stamps are right even if the host's clock is wrong.
 boot + pairs   (SYSTEM_TIME) from boot to Unix by the least of Unix less boot, as boot is cut off to a millisecond, while
-               Unix is trusted and the result is plausible against the least offset; else least offset.
+               Unix is trusted and the result is within STEP of the least offset: a pair that claims that the quickest
+               sample of a link takes longer has a wrong Unix time. Else least offset. So a pair never steps a clock.
 least offset   the least receipt - stamp of the clock, as a line with drift: see `OffsetFloor`.
 
 The shift is a continuous, piecewise linear function of the sensor's stamp. It slews towards the aim by at most 1/20 of
@@ -26,6 +27,8 @@ late           by as much, without a fall: a stalled link, or the host was set f
 Consecutive stamps of one source that agree re-align the clock at once: a new epoch, counted, which may step either way. A
 stamp of any source that fits ends every streak; but with a least offset not that of another source a little in the
 future, which may just be the quicker one. A repeated stamp adds nothing.
+
+A clock that drifts by more than a crystal can (see `DriftWatch`) is unusable: its stamps are invalid as long as it does.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Literal
 
+from fusiond.timeline.drift import LIMIT, DriftWatch
 from fusiond.timeline.least_offset import BILLION, OffsetFloor
 from fusiond.timeline.timesync import RoundTrips
 from fusiond.units import MILLISECOND, SECOND
@@ -52,6 +56,8 @@ PIECE = 50 * MILLISECOND  # minimum length of a linear piece of the shift
 PIECES = 256  # pieces kept for old stamps: 6 s and more
 STEP = 250 * MILLISECOND  # if the aim is farther off than this, and than slewing reaches, the shift steps: a re-alignment
 
+UNUSABLE = "its clock drifts too fast"
+
 Method = Literal["arrival", "unix", "timesync", "system_time", "least_offset"]
 
 
@@ -67,6 +73,7 @@ class ClockReport:
     strays: int  # stamps that were invalid
     samples: int
     note: str = ""
+    usable: bool = True  # False: it drifts by more than a crystal can, and its stamps are invalid
 
 
 class _Verdict(Enum):
@@ -127,11 +134,17 @@ class Aligner:
         self.complaint = ""  # why a better method is not in use
         self._unix = unix
         self._pieces: deque[_Piece] = deque(maxlen=PIECES)
+        self._watch()
+
+    def _watch(self) -> None:
+        self._receipts = DriftWatch()  # of receipt less stamp, which rises where the host's clock is faster
+        self._requests = DriftWatch()  # of stamp less request, which falls there
 
     def forget(self) -> None:
         """Forget all but the counts; the next stamp is like the first."""
         self.complaint = ""
         self._pieces.clear()
+        self._watch()
 
     def _begin(self, stamp: int, receive: int, offset: int) -> None:
         """Forget everything; from here on, receipt less stamp is `offset` or more."""
@@ -174,17 +187,26 @@ class Aligner:
             self.trusted = 0 <= floor <= PLAUSIBLE_LATENCY
         if not self.anchored:
             return floor
-        aim = self._trips.at(receive) if self.synchronised else self.bridge
+        aim = self._tripped(receive) if self.synchronised else self.bridge
         if aim is None:
             aim = self._pairs.at(receive) if self._pairs else 0
         return min(aim, floor + FUTURE_TOLERANCE)
+
+    def _tripped(self, receive: int) -> int | None:
+        """The offset by round trips, and by the receipts; None before the first trip."""
+        bounds = self._trips.bounds(receive, self._floor.at(receive))
+        return None if bounds is None else sum(bounds) // 2
 
     def place(self, source: str, stamp: int, receive: int) -> int | str:
         """Learn from a stamp. Returns it on the time line, or the reason why it is invalid."""
         offset = receive - stamp
         self.samples += 1
+        self._receipts.add(receive, offset)
         if not self._pieces:
             self._begin(stamp, receive, offset)
+        if self._receipts.drift or self._requests.drift:
+            self.strays += 1
+            return UNUSABLE
         last = self._pieces[-1]
         piece = last if last.start <= stamp <= last.end else self._piece(stamp, receive)
         aligned = stamp + piece.at(stamp)
@@ -291,28 +313,40 @@ class Aligner:
             self._odd_pair = unix_less_boot
             return
         future = pairs.at(receive) - self._floor.at(receive)
-        self.trusted = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.trusted else 2)
+        share = 1 if self.trusted else 2
+        self.trusted = -STEP // share <= future <= FUTURE_TOLERANCE // share
         self.complaint = "" if self.trusted else "SYSTEM_TIME contradicts receipts"
 
     def learn_trip(self, stamp: int, sent: int, receive: int) -> None:
         """Learn from a reading of this clock made between `sent` and `receive`."""
         if not self._pieces:
             return
+        self._requests.add(receive, stamp - sent)
         self._trips.add(stamp, sent, receive)
-        offset = self._trips.at(receive)
-        if offset is not None:
-            future = offset - self._floor.at(receive)
-            self.synchronised = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.synchronised else 2)
-            if not self.synchronised:
+        floor = self._floor.at(receive)
+        if (bounds := self._trips.bounds(receive, floor)) is not None:
+            least, most = bounds
+            future, uncertainty = (least + most) // 2 - floor, (most - least) // 2
+            plausible = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.synchronised else 2)
+            self.synchronised = plausible and uncertainty <= STEP
+            if not plausible:
                 self.complaint = "TIMESYNC contradicts receipts"
+            elif not self.synchronised:
+                self.complaint = f"TIMESYNC is uncertain by {uncertainty // MILLISECOND} ms"
 
     def bridge_to(self, unix: Aligner, receive: int) -> None:
         """Set the Unix clock's offset from the host's, if this clock's offset from both is known."""
-        offset = self._trips.at(receive) if self._pieces and self.synchronised and self._pairs else None
+        offset = self._tripped(receive) if self._pieces and self.synchronised and self._pairs else None
         if offset is not None and self._pairs and unix.begun:
             bridge = offset - self._pairs.at(receive)
-            plausible = -PLAUSIBLE_LATENCY <= bridge - unix.floor_at(receive) <= FUTURE_TOLERANCE
+            plausible = -STEP <= bridge - unix.floor_at(receive) <= FUTURE_TOLERANCE
             unix.bridge = bridge if plausible else None
+
+    @property
+    def drift(self) -> int | None:
+        """How much faster the host's clock runs [ppb], where that is beyond use."""
+        requests = self._requests.drift
+        return self._receipts.drift or (-requests if requests else None)
 
     def report(self) -> ClockReport:
         """How the clock is aligned at present."""
@@ -328,5 +362,8 @@ class Aligner:
         elif self._pairs and not self._unix.trusted:
             note = "SYSTEM_TIME: Unix time is not trusted"
         jitter = self._latency // max(1, self._placed)
-        drift = self._floor.slope / 1e3
-        return ClockReport(method, offset, drift, jitter, self.resets, self.strays, self.samples, note)
+        drift, usable = self._floor.slope, self.drift is None
+        if self.drift is not None:
+            drift, speed = self.drift, 1 - self.drift / BILLION
+            note = f"unusable: it runs {speed:.4f} times as fast as the host's; {LIMIT // 1000} ppm are possible"
+        return ClockReport(method, offset, drift / 1e3, jitter, self.resets, self.strays, self.samples, note, usable)

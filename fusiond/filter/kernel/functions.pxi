@@ -991,13 +991,23 @@ cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_
 
 cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef double* memory
+    cdef double* a
     cdef bint same
+    cdef bint fine
+    cdef int64_t kind
+    cdef double change
     cdef double odds
     cdef int64_t i
     cdef double _t1
     memory = state.memory + (params.imu_source) * MEMORY_SIZE
-    same = inertial_sample_judge_axes(state, values, params)
-    source_health_judge_repetition(memory, state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE, same, t_ns)
+    a = state.auxiliary
+    same, fine = inertial_sample_judge_axes(state, values, params), False
+    for kind in range(2):
+        change = (a[43] if (kind == 0) else a[44])
+        if (change >= (3 * portable_square((4.0 * a[(52 + kind)])))):
+            fine = True
+    if (fine or (not same)):
+        source_health_judge_repetition(memory, state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE, same, t_ns)
     if (memory[20] > 0):
         odds = 0.0
         for i in range(6):

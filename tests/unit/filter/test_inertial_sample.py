@@ -252,3 +252,18 @@ def test_no_alarm_in_a_drive() -> None:
         fusion = fuse(config(), spoiled(measurements(town(40.0), seed=seed), lambda z, _t, _n: quantised(z, STEPS)))
         assert fusion.outcomes()["imu0"]["REJECTED"] == 0
         assert fusion.health(T0 + 40 * SECOND)["imu0"].probabilities[3] < 0.1
+
+
+@needs_compiled
+def test_a_coarse_sensor_that_repeats_itself_is_not_called_frozen() -> None:
+    """SCALED_IMU, and an autopilot's filters have taken most of the noise away: on a straight road all axes repeat."""
+    rng = np.random.default_rng(3)
+
+    def coarse(z: Array, _t: float, _n: int) -> Array:
+        return quantised(z + 0.2 * STEPS * rng.standard_normal(6), STEPS)
+
+    straight = drive(60.0, lambda t: 12.0 * ramp(t, 3.0, 6.0), lambda t: 0 * t + 0.3)
+    fusion = Fusion(config(filter={"heading_deg": 17.2}))
+    for event in spoiled(measurements(straight, seed=None), coarse):
+        fusion.fuse(event)
+        assert fusion.health(event.t_ns)["imu0"].status != "frozen"

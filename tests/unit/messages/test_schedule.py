@@ -35,10 +35,13 @@ class Player:
             second, wobble = begin_s + number / 50, 0.01 * (number % 7 - 3)
             self._feed("imu0", second, ImuSample((wobble, 0.0, -9.81), (1e-4, wobble / 10, 0.0)))
             if number % 10 == 0:
-                latitude = math.radians(48.0) + metres_off(second) / 6.4e6
-                self._feed("gps0.position", second + 1e-3, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
-                self._feed("gps0.velocity", second + 1e-3, GnssVelocity(0.0, 0.0, 0.0, 0.1))
+                self.gnss(second + 1e-3, metres_off(second))
         self.engine.finish()
+
+    def gnss(self, second: float, metres_off: float) -> None:
+        latitude = math.radians(48.0) + metres_off / 6.4e6
+        self._feed("gps0.position", second, GnssPosition(latitude, 0.2, 500.0, 0.5, 1.0))
+        self._feed("gps0.velocity", second, GnssVelocity(0.0, 0.0, 0.0, 0.1))
 
     def _feed(self, source: str, second: float, payload: ImuSample | GnssPosition | GnssVelocity) -> None:
         t_ns = 1_700_000_000 * SECOND + round(second * SECOND)
@@ -88,3 +91,36 @@ def test_a_gap_in_the_data_is_published(tmp_path: Path) -> None:
     texts = [message.text for message in player.published if isinstance(message, EventMessage)]
     assert "state reset: no data for more than 3 s; aligning again" in texts
     assert "imu0: nothing received for 2 s" in texts
+
+
+def test_a_source_that_never_came_is_absent(tmp_path: Path) -> None:
+    """The inertial sensor, so that nothing can begin; the receiver and the wheels come, or not."""
+    player = Player(configuration(tmp_path, "udpin:127.0.0.1:1"))
+    for number in range(50):
+        player.gnss(number / 10, 0.0)
+    player.engine.finish()
+    health = [message for message in player.published if isinstance(message, HealthMessage)][-1]
+    statuses = {name: source.status for name, source in health.sources.items()}
+    assert statuses == {"imu0": "absent", "gps0.position": "nominal", "gps0.velocity": "nominal", "left": "absent",
+                        "right": "absent"}  # fmt: skip
+    assert health.sources["imu0"].reason == "not received for 4.0 s"
+    lost = [m.text for m in player.published if isinstance(m, EventMessage) and m.kind == "source_lost"]
+    assert lost == [f"{source}: not received for 3.0 s" for source in ("imu0", "left", "right")]  # once
+
+
+def test_a_clock_at_another_speed_is_named(tmp_path: Path) -> None:
+    """A simulator at double speed: no sample is used, and the reason is said."""
+    player = Player(configuration(tmp_path, "udpin:127.0.0.1:1"))
+    start = 1_700_000_000 * SECOND
+    for number in range(50 * 15):
+        t_ns = number * SECOND // 50
+        sample = ImuSample((0.01 * (number % 7), 0.0, -9.81), (1e-4, 0.0, 0.0))
+        player.engine.feed(Received("imu0", number, "fc/7/boot", SECOND + 2 * t_ns, start + t_ns, sample))
+    player.engine.finish()
+    events = [m for m in player.published if isinstance(m, EventMessage) and m.kind == "clock"]
+    assert [(event.subject, event.severity) for event in events] == [("fc/7/boot", "critical")]
+    assert events[0].text.startswith("clock fc/7/boot: unusable: it runs 2.0000 times as fast as the host's")
+    health = [message for message in player.published if isinstance(message, HealthMessage)][-1]
+    clock = health.sources["imu0"].clock
+    assert clock is not None and clock.drift_ppm == pytest.approx(-1e6)
+    assert player.engine.fusion.invalid["imu0"]["its clock drifts too fast"] > 100

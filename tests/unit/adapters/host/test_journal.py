@@ -76,6 +76,7 @@ def test_a_journal_that_is_away_is_no_error(tmp_path: Path) -> None:
 def test_events_have_ids_of_their_own() -> None:
     assert journal.about("mode", "nominal") == {"FUSIOND_MODE": "nominal", "MESSAGE_ID": journal.EVENTS["mode"]}
     assert journal.about("source_lost", "gps0.position")["FUSIOND_SOURCE"] == "gps0.position"
+    assert journal.about("clock", "fc/1/boot")["FUSIOND_CLOCK"] == "fc/1/boot"
     own = (journal.CONNECTION_LOST, journal.DATA_LOST, journal.STARTED, journal.ENDED, journal.RELOADED)
     ids = [*journal.EVENTS.values(), *own]
     assert len(set(ids)) == len(ids) and all(len(bytes.fromhex(number)) == 16 for number in ids)

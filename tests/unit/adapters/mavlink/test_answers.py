@@ -37,6 +37,8 @@ def int_(command: int, *values: float) -> Any:
         (long(SET, GLOBAL, -1), ACCEPTED),
         (long(SET, GLOBAL, -7), DENIED),
         (long(SET, GLOBAL, math.nan), DENIED),
+        (long(SET, GLOBAL, 3e9), DENIED),  # MESSAGE_INTERVAL could not say it
+        (long(SET, GLOBAL, math.inf), DENIED),
         (long(SET, 33, 50_000), UNSUPPORTED),
         (long(SET, math.nan, 50_000), UNSUPPORTED),
         (long(GET, GLOBAL), ACCEPTED),
