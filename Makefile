@@ -1,6 +1,7 @@
 # make demo    fuse a bundled drive and explain the result (out/demo)
 # make test    lint, types, tests
 # make study   the long studies; make bench the benchmarks; make soak an hour of full load, as fast as possible
+# make fuzz    damaged input of every kind, a million frames and more; SEED=1 repeats a run, SECONDS=60 ends it sooner
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
 # make clean   remove what was made
@@ -13,7 +14,9 @@ READY := $(VENV)/ready
 TYPING := build/typing/fusiond_adapters
 DEMO := fusiond/app/demo/data
 
-.PHONY: demo test test-system lint study bench soak demo-data deb install uninstall clean
+SEED ?= 1
+
+.PHONY: demo test test-system fuzz lint study bench soak demo-data deb install uninstall clean
 
 demo: $(READY)
 	$(BIN)/fusiond demo --out out/demo
@@ -23,6 +26,9 @@ test: lint
 
 test-system: $(READY)
 	$(BIN)/python -m tests.system $(if $(HERE),--here)
+
+fuzz: $(READY)
+	$(BIN)/python -m tests.fuzz --seed $(SEED) $(if $(SECONDS),--seconds $(SECONDS))
 
 lint: $(READY) $(TYPING)
 	$(BIN)/ruff check .

@@ -52,7 +52,7 @@ def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
             try:
                 t_ns = round(message.timestamp * 1e6) * MICROSECOND  # a float of Unix time is not more accurate
             except (ValueError, OverflowError):
-                counts["bad lines"] += 1
+                counts["bad stamps"] += 1
                 continue
             channel = None if message.channel is None else str(message.channel)
             yield LogFrame(t_ns, channel, message.arbitration_id, message.is_extended_id, bytes(message.data))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import signal
 import sys
 from types import ModuleType
 
@@ -26,6 +27,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
+    _die_of_interrupts()
     gc.disable()  # imported modules never become garbage: collecting would take a tenth of the start
     asyncio = _asyncio()
     import numpy  # noqa: F401, PLC0415 - not from a deep call stack, where Python maps and unmaps its stack at every call
@@ -41,6 +43,13 @@ def run(arguments: argparse.Namespace) -> None:
         return config.load(arguments.config)
 
     asyncio.run(serve(Daemon(load(), load)))
+
+
+def _die_of_interrupts() -> None:
+    """Until the daemon has its own handlers, SIGINT ends the process at once, as SIGTERM does: nothing is open yet, and an
+    exception that is raised between any two instructions crashed a library (msgspec). Ignored, it stays so."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _asyncio() -> ModuleType:
