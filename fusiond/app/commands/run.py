@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import gc
-import signal
 import sys
 from types import ModuleType
 
-from fusiond.app.commands import EXIT_CODES
+from fusiond.app.commands import EXIT_CODES, interrupts_end_at_once
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond_adapters.host import journal
@@ -27,7 +26,11 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
-    _die_of_interrupts()
+    with interrupts_end_at_once():  # until the daemon has its own handlers: nothing is open yet
+        _run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> None:
     gc.disable()  # imported modules never become garbage: collecting would take a tenth of the start
     asyncio = _asyncio()
     import numpy  # noqa: F401, PLC0415 - not from a deep call stack, where Python maps and unmaps its stack at every call
@@ -43,13 +46,6 @@ def run(arguments: argparse.Namespace) -> None:
         return config.load(arguments.config)
 
     asyncio.run(serve(Daemon(load(), load)))
-
-
-def _die_of_interrupts() -> None:
-    """Until the daemon has its own handlers, SIGINT ends the process at once, as SIGTERM does: nothing is open yet, and an
-    exception that is raised between any two instructions crashed a library (msgspec). Ignored, it stays so."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _asyncio() -> ModuleType:
