@@ -4,6 +4,7 @@
 # make fuzz    damaged input of every kind, a million frames and more; SEED=1 repeats a run, SECONDS=60 ends it sooner
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
+# make lock    choose the libraries of the installed service anew: packaging/*requirements.txt, with their hashes
 # make clean   remove what was made
 # Everything needed is set up in a virtual environment (.venv). PYTHON selects the interpreter, 3.11 or later.
 
@@ -16,7 +17,7 @@ DEMO := fusiond/app/demo/data
 
 SEED ?= 1
 
-.PHONY: demo test test-system fuzz lint study bench soak demo-data deb install uninstall clean
+.PHONY: demo test test-system fuzz lint study bench soak demo-data deb install uninstall lock clean
 
 demo: $(READY)
 	$(BIN)/fusiond demo --out out/demo
@@ -61,8 +62,16 @@ uninstall:
 	packaging/prerm remove
 	rm -rf /opt/fusiond /usr/share/fusiond
 	rm -f /usr/bin/fusiond /usr/lib/systemd/system/fusiond.service /usr/lib/systemd/system/fusiond@.service
-	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf
+	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf /usr/share/man/man1/fusiond.1.gz
+	rm -rf /usr/share/doc/fusiond
 	packaging/postrm remove
+
+# Without lxml, which only pymavlink's generator uses.
+LOCK := uv pip compile --quiet --upgrade --generate-hashes --universal --python-version 3.11 --no-header --no-annotate
+
+lock:
+	$(LOCK) --no-emit-package lxml pyproject.toml --output-file packaging/requirements.txt
+	$(LOCK) packaging/build.in --output-file packaging/build-requirements.txt
 
 $(READY): pyproject.toml setup.py $(wildcard fusiond/filter/kernel/*.px[ix])
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'

@@ -45,7 +45,7 @@ link = "fc"
 link = "fc"
 """
 UP_S, AFTER_S = 1.0, 1.0  # moments: before it is up, at most this long after the start; after it was up
-LIMIT_S = 60.0  # to come up, and to end
+LIMIT_S = 120.0  # to come up, and to end, on a busy machine
 READ_S = 0.02  # between two queries of the reader
 PYTHONS_OWN = "init_import_site"  # in what Python says where a signal interrupts its own start
 ORDERLY = {signal.SIGINT: {0, 130, -signal.SIGINT}, signal.SIGTERM: {0, -signal.SIGTERM}}  # the latter while it starts
