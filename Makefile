@@ -4,7 +4,7 @@
 # make fuzz    damaged input of every kind, a million frames and more; SEED=1 repeats a run, SECONDS=60 ends it sooner
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
-# make lock    choose the libraries of the installed service anew: packaging/*requirements.txt, with their hashes
+# make lock    choose the libraries of the installed service anew (with uv): packaging/*requirements.txt, with hashes
 # make clean   remove what was made
 # Everything needed is set up in a virtual environment (.venv). PYTHON selects the interpreter, 3.11 or later.
 
