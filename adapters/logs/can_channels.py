@@ -6,8 +6,8 @@ channel is used: so a log of one bus needs no configuration, and a warning names
 that, unless the bus is named with the log (`BUS=path`) or the format has no channels. Frames on other channels are counted;
 if all of the first wheel frames are on other channels, that is an error.
 
-Counts: `frames` (all readable ones), `other ids`, `other channels`, `error frames`, `remote frames`, `bad lines`,
-`unreadable tail` (the rest of a damaged binary log), `bad stamps` (wheel frames dropped for their stamp).
+Counts: `frames` (all readable ones), `other ids`, `other channels`, `error frames`, `remote frames`, `bad lines`, `bad rows`
+(of a .db), `unreadable tail` (the rest of a damaged binary log), `bad stamps` (wheel frames dropped for their stamp).
 """
 
 from __future__ import annotations
@@ -98,11 +98,13 @@ def _events(opening: Opening, read: FrameReader, decoders: Mapping[str, CanDecod
 
 
 def _without_strays(frames: Iterator[LogFrame], log: LogFile) -> Iterator[LogFrame]:
-    """The frames without those whose stamp alone jumps and returns: a damaged digit would delay everything after it. If the
-    next stamps follow a jump, the clock was set."""
+    """The frames without those whose stamp cannot be one, or alone jumps and returns: a damaged digit would delay everything
+    after it. If the next stamps follow a jump, the clock was set."""
     last_ns: int | None = None
     held: LogFrame | None = None
     for frame in frames:
+        if not log.takes_stamp(frame.t_ns):
+            continue
         if held is not None:
             jump_ns = 0 if last_ns is None else abs(held.t_ns - last_ns)
             if jump_ns > STEP_NS and last_ns is not None and abs(frame.t_ns - held.t_ns) > abs(frame.t_ns - last_ns):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.logs.can_channels import ID_BITS, LogFrame, Wanted, open_can_log
-from fusiond_adapters.logs.file import LogFile
+from fusiond_adapters.logs.file import MAX_LINE, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 
 LINE = re.compile(
@@ -16,10 +16,10 @@ LINE = re.compile(
     rb"#(?:#[0-9A-Fa-f])?([0-9A-Fa-f]*|[Rr][0-9A-Fa-f]?)(?:\s+[RTrt])?\s*"  # #data, ##flags data, or #R
 )
 OTHERS = (  # lines as candump itself writes them, of data frames whose ids are not among those at %(ids)b
-    rb"((?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%(ids)b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*+\n)*+)"
+    rb"((?:\(\d{1,10}\.\d{1,9}\) \S+ (?!(?:%(ids)b)#)(?:[0-9A-F]{3}|[01][0-9A-F]{7})#[0-9A-F]*+\n)*)"
 )
-WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*+)\n)?+"  # such a line with an id that is among them
-MAX_LINE = 1 << 16  # bytes; a longer line is not text
+WANTED = rb"(?:\((\d{1,10})\.(\d{6})\) (\S+) (%(ids)b)#((?:[0-9A-F]{2})*)\n)?"  # such a line with an id that is among them
+# Only a set of characters may be possessive (`*+`): before 3.11.5 Python matches a possessive group wrongly.
 ERROR_FLAG = 0x20000000  # in the 8-digit ids of candump
 
 

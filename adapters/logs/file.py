@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fusiond.errors import UnusableError
+from fusiond.units import SECOND
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 BLOCK = 1 << 18  # bytes read at a time
+MAX_LINE = 1 << 16  # characters; a longer line is not text
+STAMP_UNTIL_NS = 4_102_444_800 * SECOND  # 2100; stamps of 2262 and later do not fit into 64 bits
 
 
 class LogError(UnusableError):
@@ -82,10 +85,20 @@ class LogFile:
 
     def stream(self) -> io.BufferedReader:
         """The content as a file object, for readers that need one."""
-        return io.BufferedReader(_BlockStream(self.blocks()))
+        return io.BufferedReader(BlockStream(self.blocks()))
+
+    def takes_stamp(self, t_ns: int) -> bool:
+        """Whether a stamp can be one: from 1970 to 2099. Others are counted as `bad stamps`, and a warning is given."""
+        taken = 0 <= t_ns < STAMP_UNTIL_NS
+        if not taken:
+            self.counts["bad stamps"] += 1
+            warning = f"{self.path}: frames stamped before 1970 or after 2099 are left out"
+            if warning not in self.warnings:
+                self.warnings.append(warning)
+        return taken
 
 
-class _BlockStream(io.RawIOBase):
+class BlockStream(io.RawIOBase):
     """A file object over an iterator of blocks."""
 
     def __init__(self, blocks: Iterator[bytes]) -> None:

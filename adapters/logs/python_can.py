@@ -16,12 +16,14 @@ import can
 from can.io.blf import BLFParseError
 
 from fusiond.units import MICROSECOND
+from fusiond_adapters.logs.blf import checked
 from fusiond_adapters.logs.can_channels import LogFrame, Wanted, open_can_log
-from fusiond_adapters.logs.file import LogError, LogFile
+from fusiond_adapters.logs.file import MAX_LINE, BlockStream, LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 
 BINARY = (".blf", ".db", ".mf4")  # the others are text
 MF4_MAGIC = (b"MDF", b"UnFinMF")
+MAX_ROW, MIN_ROW = 1 << 16, 4  # bytes of a row in a .db
 
 # Exceptions of python-can's readers on content that is not of their format.
 DAMAGE: tuple[type[Exception], ...] = (
@@ -50,27 +52,35 @@ def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
             try:
                 t_ns = round(message.timestamp * 1e6) * MICROSECOND  # a float of Unix time is not more accurate
             except (ValueError, OverflowError):
-                counts["bad lines"] += 1
+                counts["bad stamps"] += 1
                 continue
             channel = None if message.channel is None else str(message.channel)
             yield LogFrame(t_ns, channel, message.arbitration_id, message.is_extended_id, bytes(message.data))
 
 
 class _Text(io.TextIOWrapper):
-    """The text of a log; counts the lines read."""
+    """The text of a log; counts the lines read. A line that is too long is left out, and never held as a whole."""
 
-    lines = 0
+    def __init__(self, log: LogFile) -> None:
+        super().__init__(log.stream(), encoding="utf-8", errors="replace")
+        self.lines = 0
+        self._counts = log.counts
 
     def __next__(self) -> str:  # type: ignore[override]  # typeshed's own TextIOWrapper needs the same
-        line = super().__next__()
-        self.lines += 1
-        return line
+        while line := self.readline(MAX_LINE):
+            self.lines += 1
+            if len(line) < MAX_LINE or line.endswith("\n"):
+                return line
+            self._counts["bad lines"] += 1
+            while line and not line.endswith("\n"):
+                line = self.readline(MAX_LINE)
+        raise StopIteration
 
 
 def _messages(log: LogFile) -> Iterator[can.Message]:
     """python-can's messages. After a bad line of a text format, reading continues and loses at most one more line; a binary
     format ends there."""
-    text = None if log.suffix in BINARY else _Text(log.stream(), encoding="utf-8", errors="replace")
+    text = None if log.suffix in BINARY else _Text(log)
     damage = (*DAMAGE, *_mf4_damage(log)) if log.suffix == ".mf4" else DAMAGE
     try:
         reader = _open(log, text)
@@ -81,9 +91,12 @@ def _messages(log: LogFile) -> Iterator[can.Message]:
         while True:
             try:
                 yield from reader
-            except damage:
+            except damage as error:
                 if text is None:
+                    if not log.counts["frames"]:
+                        raise LogError(f"{log.path}: is not a {log.suffix} log: {error}") from error
                     log.counts["unreadable tail"] += 1
+                    log.warnings.append(f"{log.path}: cannot be read to its end: {error}")
                     return
                 if text.lines <= lines:
                     return  # the end: the reader failed because a header is missing
@@ -100,13 +113,48 @@ def _open(log: LogFile, text: _Text | None) -> can.io.generic.MessageReader:
             return can.ASCReader(text, relative_timestamp=False)
         return can.TRCReader(text) if log.suffix == ".trc" else can.CSVReader(text)
     if log.suffix == ".blf":
-        return can.BLFReader(log.stream())
+        return can.BLFReader(io.BufferedReader(BlockStream(checked(log.stream()))))
     if log.suffix == ".db":
-        return can.SqliteReader(log.path)
+        return _Sqlite(log)
     with log.path.open("rb") as file:
         if not file.read(8).startswith(MF4_MAGIC):  # checked first: asammdf prints to standard error besides raising
             raise ValueError("it does not start like one")
     return can.MF4Reader(log.path)
+
+
+class _Sqlite(can.io.generic.MessageReader):
+    """The rows of python-can's table. Its own reader would run a view of that name, which may have any number of rows of
+    any size. Raises sqlite3.Error, ValueError."""
+
+    def __init__(self, log: LogFile) -> None:
+        self._log = log
+        self._base = sqlite3.connect(f"{log.path.absolute().as_uri()}?mode=ro", uri=True)
+        self._base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_ROW)
+        self._base.execute("PRAGMA trusted_schema = OFF")
+        kinds = [row[2] for row in self._base.execute("PRAGMA main.table_list('messages')")]
+        if kinds != ["table"]:
+            self._base.close()
+            raise ValueError(f"its 'messages' is a {kinds[0]}" if kinds else "it has no table 'messages'")
+
+    def __iter__(self) -> Iterator[can.Message]:
+        most_rows = self._log.bytes_total // MIN_ROW  # a damaged tree may lead to the same row again and again
+        for number, row in enumerate(self._base.execute("SELECT * FROM main.messages")):
+            if number > most_rows:
+                raise ValueError(f"more than {most_rows} rows")
+            try:
+                yield _message(*row)
+            except (TypeError, ValueError):
+                self._log.counts["bad rows"] += 1
+
+    def stop(self) -> None:
+        self._base.close()
+
+
+def _message(t_s: float, number: int, extended: int, remote: int, error: int, dlc: int, data: bytes | None) -> can.Message:
+    """A row as a message. Raises TypeError if a cell is of the wrong type."""
+    if not (isinstance(t_s, int | float) and isinstance(number, int) and isinstance(data, bytes | None)):
+        raise TypeError
+    return can.Message(t_s, number, bool(extended), bool(remote), bool(error), dlc=dlc, data=data)
 
 
 def _mf4_damage(log: LogFile) -> Iterator[type[Exception]]:
@@ -114,6 +162,7 @@ def _mf4_damage(log: LogFile) -> Iterator[type[Exception]]:
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{log.path}: reading .mf4 needs the extra mf4: pip install 'fusiond[mf4]'")
     yield RuntimeError
+    yield MemoryError  # it believes sizes
     for module, name in (("asammdf.blocks.utils", "MdfException"), ("isal.igzip_lib", "IsalError"), ("zstd", "Error")):
         if importlib.util.find_spec(module.partition(".")[0]) is not None:
             yield getattr(importlib.import_module(module), name)

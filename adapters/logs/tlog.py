@@ -16,7 +16,7 @@ from struct import Struct
 
 from fusiond.events import Received
 from fusiond.units import MICROSECOND
-from fusiond_adapters.logs.file import LogError, LogFile
+from fusiond_adapters.logs.file import STAMP_UNTIL_NS, LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.decoder import (
     CHECKSUM,
@@ -37,7 +37,6 @@ RECORD_2 = Struct(">Q10B")  # stamp, and the header of a MAVLink 2 frame
 OVERHEAD = STAMP_SIZE + HEADER_2 + CHECKSUM  # bytes of a MAVLink 2 record without its payload
 OVERHEAD_SIGNED = OVERHEAD + SIGNATURE
 MAGICS = (MAGIC_1, MAGIC_2)
-STAMP_UNTIL_US = 4_102_444_800 * 10**6  # 2100
 RESYNC_REACH_US = 366 * 86_400 * 10**6  # a record found after garbage is stamped within a year of the one before
 STEP_US = 10**6  # a stamp that jumps by more is compared with the next one
 REACH = 2 * (STAMP_SIZE + MAX_FRAME_BYTES)  # bytes in which a whole record and the next one's beginning lie
@@ -67,6 +66,7 @@ class _Records:
     """Cuts a .tlog into records and decodes them."""
 
     def __init__(self, log: LogFile, decoder: MavlinkDecoder) -> None:
+        self._log = log
         self._blocks = log.blocks()
         self._counts = log.counts
         self._decoder, self._dialect = decoder, decoder.dialect
@@ -168,7 +168,7 @@ class _Records:
     def _may_resume(self, at: int) -> bool:
         stamp_us: int = STAMP.unpack_from(self._buffer, at)[0]
         if self._last_us is None:
-            return stamp_us < STAMP_UNTIL_US
+            return stamp_us * MICROSECOND < STAMP_UNTIL_NS
         return abs(stamp_us - self._last_us) < RESYNC_REACH_US
 
     def _is_cut(self, at: int) -> bool:
@@ -189,6 +189,8 @@ class _Records:
     def _stamp_is_good(self, stamp_us: int, following: int) -> bool:
         """Compare a stamp with the last one and, where it jumps, with that of the record at `following`."""
         last_us = self._last_us
+        if not self._log.takes_stamp(stamp_us * MICROSECOND):
+            return False
         if last_us is not None and not -STEP_US <= stamp_us - last_us <= STEP_US:
             next_us = self._stamp_at(following)
             alone = next_us is not None and abs(next_us - stamp_us) > abs(next_us - last_us)
@@ -198,9 +200,6 @@ class _Records:
                 return False
             if stamp_us < last_us:
                 self._counts["clock set back"] += 1
-        elif last_us is None and stamp_us >= STAMP_UNTIL_US:
-            self._counts["bad stamps"] += 1
-            return False
         self._last_us = stamp_us
         return True
 

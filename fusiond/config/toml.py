@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import tomllib
@@ -13,6 +14,9 @@ import msgspec
 from msgspec import Meta, Struct
 
 from fusiond.errors import UsageError
+
+MAX_BYTES, MAX_LINE = 1 << 18, 2000  # of a file; characters of a line. A dotted key takes time by its length squared
+INTEGERS = range(-(1 << 63), 1 << 63)  # as TOML has them
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="a name of letters, digits and underscores")]
 Positive = Annotated[float, Meta(gt=0)]
@@ -31,7 +35,11 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 def read_text(path: Path) -> str:
     """The text of a file. Raises ConfigError."""
     try:
-        return path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise ConfigError(f"{path}: is larger than {MAX_BYTES >> 10} KiB")
+        return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8").read()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -43,14 +51,20 @@ Table = TypeVar("Table", bound=Section)
 
 def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
     """Check the text of a TOML file against a struct. `given` are fields that no file may set. Raises ConfigError."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if len(line) > MAX_LINE:
+            raise ConfigError(f"{path}:{number}: a line of {len(line)} characters; at most {MAX_LINE}")
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        unusable = list(_unusable_numbers(table))
+    except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: tables or arrays are nested too deeply") from error
     for key in given:
         if key in table:
             raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: unknown key")
-    refuse([(key, "must be a finite number") for key in _not_finite(table)], text, path)
+    refuse(unusable, text, path)
     try:
         return msgspec.convert(table | given, kind)
     except msgspec.ValidationError as error:
@@ -63,16 +77,18 @@ def refuse(complaints: Iterable[tuple[str, str]], text: str, path: Path) -> None
         raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
 
 
-def _not_finite(value: object, key: str = "") -> Iterator[str]:
-    """The dotted keys of all numbers in a table or array that are inf or nan."""
+def _unusable_numbers(value: object, key: str = "") -> Iterator[tuple[str, str]]:
+    """The dotted key of every number in a table or array that is inf, nan or beyond 64 bits, and what is wrong with it."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _not_finite(inner, f"{key}.{name}" if key else name)
+            yield from _unusable_numbers(inner, f"{key}.{name}" if key else name)
     elif isinstance(value, list):
         for place, inner in enumerate(value):
-            yield from _not_finite(inner, f"{key}[{place}]")
+            yield from _unusable_numbers(inner, f"{key}[{place}]")
     elif isinstance(value, float) and not math.isfinite(value):
-        yield key
+        yield key, "must be a finite number"
+    elif isinstance(value, int) and value not in INTEGERS:
+        yield key, "must fit into 64 bits"
 
 
 def _explain(

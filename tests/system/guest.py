@@ -7,6 +7,7 @@ disk is a throwaway copy, its network loopback only. It sees the job's folder of
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -42,12 +43,19 @@ KillMode=process
 """
 
 
+NO_ERROR = re.compile(r"(?i)(?:W|N|I|warning|notice|note|info)\s*:")  # lines that begin like this
+
+
 class Unavailable(Exception):
     """No guest can run on this machine; the message says why."""
 
 
+class BuildError(Exception):
+    """What this machine should be able to build cannot be built; the message says why."""
+
+
 def build(cache: Path) -> None:
-    """Create the guest's kernel and disk in a folder, once. Raises Unavailable."""
+    """Create the guest's kernel and disk in a folder, once. Raises Unavailable, BuildError."""
     if (cache / "root.img").is_file():
         return
     if sys.version_info[:2] != PYTHON:
@@ -62,48 +70,44 @@ def build(cache: Path) -> None:
     root = cache / "root"
     shutil.rmtree(root, ignore_errors=True)
     paths = [f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in ("man", "doc", "locale")]
-    _call([str(_tool(tools, "mmdebstrap")), "--quiet", "--variant=minbase", f"--include={INCLUDE}", *paths,
-           '--aptopt=APT::Install-Recommends "false"', SUITE, str(root)])  # fmt: skip
+    _call(["mmdebstrap", "--quiet", "--variant=minbase", f"--include={INCLUDE}", *paths,
+           '--aptopt=APT::Install-Recommends "false"', SUITE, str(root)], tools=tools)  # fmt: skip
     _furnish(root, tools)
     size = sum(path.lstat().st_size for path in root.rglob("*")) // 1_000_000 + 900  # room for what is installed
     image = cache / "root.tmp"
     image.unlink(missing_ok=True)
-    _call([str(_tool(tools, "mke2fs")), "-q", "-t", "ext4", "-O", "^has_journal", "-m", "0", "-E", "root_owner=0:0",
-           "-d", str(root), str(image), f"{size}M"])  # fmt: skip
+    _call(["mke2fs", "-q", "-t", "ext4", "-O", "^has_journal", "-m", "0", "-E", "root_owner=0:0",
+           "-d", str(root), str(image), f"{size}M"], tools=tools)  # fmt: skip
     shutil.copy2(tools / "usr/bin/linux.uml", cache / "linux")
     image.rename(cache / "root.img")
     shutil.rmtree(root)
 
 
 def _tools(folder: Path) -> Path:
-    """The packages that build and boot the guest, unpacked."""
+    """The packages that build and boot the guest, unpacked. Raises Unavailable where they cannot be fetched."""
     if (folder / "done").is_file():
         return folder
     folder.mkdir(parents=True, exist_ok=True)
     packages = ["user-mode-linux", *(() if shutil.which("mmdebstrap") else ("mmdebstrap",))]
-    packages += () if _on_path("mke2fs") else ("e2fsprogs", "libext2fs2", "libss2", "libcom-err2")
+    packages += () if shutil.which("mke2fs", path=_path()) else ("e2fsprogs", "libext2fs2", "libss2", "libcom-err2")
     try:
         _call(["apt-get", "-q", "download", *packages], folder)
-    except Unavailable:
-        _call(["apt-get", "-q", "update"])
-        _call(["apt-get", "-q", "download", *packages], folder)
+    except BuildError:
+        try:
+            _call(["apt-get", "-q", "update"])
+            _call(["apt-get", "-q", "download", *packages], folder)
+        except BuildError as error:
+            raise Unavailable(f"Debian's packages cannot be fetched: {error}") from error
     for package in folder.glob("*.deb"):
         _call(["dpkg-deb", "-x", str(package), str(folder)])
     (folder / "done").touch()
     return folder
 
 
-def _on_path(name: str) -> str | None:
-    return shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
-
-
-def _tool(tools: Path, name: str) -> Path:
-    """A program unpacked, or that of this machine."""
-    own = [path for path in (tools / "usr/bin" / name, tools / "sbin" / name, tools / "usr/sbin" / name) if path.exists()]
-    found = own[0] if own else _on_path(name)
-    if found is None:
-        raise Unavailable(f"there is no {name}")
-    return Path(found)
+def _path(tools: Path | None = None) -> str:
+    """Where programs are looked for: those unpacked first, as they call each other."""
+    unpacked = [str(tools / folder) for folder in ("usr/bin", "sbin", "usr/sbin")] if tools else []
+    return os.pathsep.join([*unpacked, os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"])
 
 
 def _furnish(root: Path, tools: Path) -> None:
@@ -133,18 +137,27 @@ def _furnish(root: Path, tools: Path) -> None:
         (units / name).symlink_to("/dev/null")
 
 
-def _call(command: Sequence[str], folder: Path | None = None) -> None:
-    environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C"}
-    if folder is None and Path(command[0]).name == "mke2fs":
-        libraries = Path(command[0]).parents[1] / "lib/x86_64-linux-gnu"
-        environment["LD_LIBRARY_PATH"] = f"{libraries}:{libraries.parents[1] / 'usr/lib/x86_64-linux-gnu'}"
+def _call(command: Sequence[str], folder: Path | None = None, tools: Path | None = None) -> None:
+    """Run a command, with the unpacked tools if given. Raises BuildError."""
+    environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C", "PATH": _path(tools)}
+    if tools is not None and (tools / "lib/x86_64-linux-gnu").is_dir():
+        environment["LD_LIBRARY_PATH"] = f"{tools}/lib/x86_64-linux-gnu:{tools}/usr/lib/x86_64-linux-gnu"
+    program = shutil.which(command[0], path=environment["PATH"])
+    if program is None:
+        raise BuildError(f"there is no {command[0]}")
     try:
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False)
+        done = subprocess.run([program, *command[1:]], cwd=folder, env=environment, capture_output=True, text=True,
+                              timeout=600, check=False)  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise Unavailable(f"{Path(command[0]).name}: {error}") from error
+        raise BuildError(f"{command[0]}: {error}") from error
     if done.returncode:
-        reason = (done.stderr.strip() or done.stdout.strip() or "failed").splitlines()[-1]
-        raise Unavailable(f"{Path(command[0]).name}: {reason}")
+        raise BuildError(f"{command[0]}: {first_error(done.stderr) or first_error(done.stdout) or 'failed'}")
+
+
+def first_error(output: str) -> str:
+    """The first line of a program's messages that is no warning or remark: those after it are mostly consequences."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    return next((line for line in lines if not NO_ERROR.match(line)), "")
 
 
 def run(cache: Path, job: Path, limit_s: float) -> int:

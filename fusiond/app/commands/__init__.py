@@ -5,6 +5,11 @@ Only the module of the given command is imported, so that the daemon starts soon
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import current_thread, main_thread
+
 COMMANDS = {
     "run": "fuse the live inputs, and publish the state",
     "replay": "fuse recorded logs into a track",
@@ -16,3 +21,18 @@ COMMANDS = {
 }
 
 EXIT_CODES = "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 130 interrupted"
+
+
+@contextmanager
+def interrupts_end_at_once() -> Iterator[None]:
+    """Inside, SIGINT ends the process as SIGTERM does, unless it is ignored or handled. Python's own handler raises an
+    exception between any two instructions; a library may swallow it in an import and stay half made: msgspec crashed."""
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not signal.default_int_handler or current_thread() is not main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)

@@ -7,7 +7,7 @@ import gc
 import sys
 from types import ModuleType
 
-from fusiond.app.commands import EXIT_CODES
+from fusiond.app.commands import EXIT_CODES, interrupts_end_at_once
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond_adapters.host import journal
@@ -26,6 +26,11 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
+    with interrupts_end_at_once():  # until the daemon has its own handlers: nothing is open yet
+        _run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> None:
     gc.disable()  # imported modules never become garbage: collecting would take a tenth of the start
     asyncio = _asyncio()
     import numpy  # noqa: F401, PLC0415 - not from a deep call stack, where Python maps and unmaps its stack at every call

@@ -101,3 +101,30 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
             file.write_bytes(content)
         with pytest.raises(ConfigError, match=name):
             config.load(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "part"),
+    [
+        (".".join(["a"] * 50_000) + " = 1", 2, "a line of 100003 characters; at most 2000"),
+        ("x = " + "1" * 5000, 2, "a line of 5004 characters; at most 2000"),
+        ("[filter]\nhorizon_s = " + "1" * 500, 3, "filter.horizon_s: must fit into 64 bits"),
+        ("[filter]\nhorizon_s = 0x" + "F" * 1900, 3, "filter.horizon_s: must fit into 64 bits"),
+        ("x = " + "[" * 1900, None, "tables or arrays are nested too deeply"),
+        ("x = [\n" + "[\n" * 9000, None, "tables or arrays are nested too deeply"),
+        ("x = " + "{a = " * 390, None, "tables or arrays are nested too deeply"),
+    ],
+)
+def test_what_would_take_without_end_is_refused(text: str, line: int | None, part: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        config.parse("\n" + text, Path("car.toml"))
+    assert str(caught.value) == f"car.toml:{line}: {part}" if line else f"car.toml: {part}"
+
+
+def test_a_file_that_is_too_large_is_not_read_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text("# a line\n" * 40_000)
+    with pytest.raises(ConfigError, match="is larger than 256 KiB"):
+        config.load(path)
+    with pytest.raises(ConfigError, match="is larger than 256 KiB"):
+        config.load(Path("/dev/zero"))

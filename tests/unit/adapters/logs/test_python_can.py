@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import random
+import sqlite3
+import tracemalloc
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from fusiond.events import WheelSpeed
 from fusiond_adapters.logs.file import LogError
-from tests.helpers.logs import START_US, WHEELS, events, written
+from fusiond_adapters.logs.merge import open_logs
+from tests.helpers.logs import START_US, WHEELS, configured, events, written
 
 
 @pytest.mark.parametrize("suffix", [".log", ".log.gz", ".asc", ".asc.gz", ".blf", ".trc", ".csv", ".csv.gz", ".db"])
@@ -56,3 +60,75 @@ def test_damaged_can_logs_never_raise(tmp_path: Path, suffix: str, count: int) -
         except LogError:
             outcomes["refused"] += 1
     assert outcomes.total() == count
+
+
+ROW = "1700000000.0,0xaa,0,0,0,8,AAAAAAAAAAA="
+LONG = 8 << 20  # characters of a line
+
+
+@pytest.mark.parametrize(
+    ("suffix", "head"), [(".asc", "base hex timestamps absolute"), (".trc", ";$FILEVERSION=1.1"), (".csv", "timestamp")]
+)
+def test_a_text_without_line_ends_is_never_held_as_a_whole(tmp_path: Path, suffix: str, head: str) -> None:
+    path = tmp_path / f"drive{suffix}"
+    path.write_text(head + "\n" + "1" * LONG)
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match="no CAN frame in it"):
+            events(path)
+        assert tracemalloc.get_traced_memory()[1] < LONG / 2
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_long_line_costs_itself_alone(tmp_path: Path) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text("\n".join(["timestamp", ROW, "x" * (1 << 17), ROW, ROW, ""]))
+    found, counts = events(path)
+    assert len(found) == 4 * 3
+    assert counts == {"frames": 3, "bad lines": 1, "decoded": 3}
+
+
+@pytest.mark.parametrize("seconds", ["9300000000", "4102444800", "-1"])  # the years 2264, 2100, 1969
+def test_a_stamp_that_cannot_be_one_is_left_out_and_told(tmp_path: Path, seconds: str) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text("\n".join(["timestamp", ROW, *[ROW.replace("1700000000", seconds)] * 3, ROW, ""]))
+    logs = open_logs([path], configured())
+    assert len(list(logs)) == 4 * 2
+    assert logs.counts[str(path)]["bad stamps"] == 3
+    assert logs.warnings == [f"{path}: frames stamped before 1970 or after 2099 are left out"]
+
+
+COLUMNS = "ts, arbitration_id, extended, remote, error, dlc, data"
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x, 170, 0, 0, 0, 8, zeroblob(9e8) FROM n"
+
+
+@pytest.mark.parametrize(
+    ("sql", "message"),
+    [
+        (f"CREATE VIEW messages AS {ENDLESS}", "its 'messages' is a view"),
+        ("CREATE TABLE other(x)", "it has no table 'messages'"),
+        (f"CREATE TABLE messages({COLUMNS} AS (zeroblob(9e8))); INSERT INTO messages VALUES (1, 2, 0, 0, 0, 8)", "too big"),
+    ],
+)
+def test_a_database_gives_rows_of_a_table_alone(tmp_path: Path, sql: str, message: str) -> None:
+    path = tmp_path / "drive.db"
+    with closing(sqlite3.connect(path)) as base:
+        base.executescript(sql)
+    with pytest.raises(LogError, match=message):
+        events(path)
+
+
+def test_a_bad_row_costs_itself_alone(tmp_path: Path) -> None:
+    path = tmp_path / "drive.db"
+    with closing(sqlite3.connect(path)) as base:
+        base.execute(f"CREATE TABLE messages({COLUMNS})")
+        good = (1.7e9, 0xAA, 0, 0, 0, 8, bytes(8))
+        base.executemany(
+            "INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)",
+            [good, ("now", *good[1:]), (*good[:1], "0xAA", *good[2:]), (*good[:6], 7.5), good],
+        )
+        base.commit()
+    found, counts = events(path)
+    assert len(found) == 4 * 2
+    assert counts == {"frames": 2, "bad rows": 3, "decoded": 2}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
+import signal
 import subprocess
 import sys
 from importlib import import_module
 
 import pytest
 
-from fusiond.app.commands import COMMANDS
+from fusiond import __main__ as entry
+from fusiond.app.commands import COMMANDS, interrupts_end_at_once
 
 HEAVY = (
     "fusiond.app.replay", "fusiond.app.demo", "fusiond.app.top", "fusiond.simulation", "zenoh", "can", "cantools", "numpy",
@@ -34,3 +37,27 @@ def test_the_daemon_imports_no_other_command() -> None:
     own = HEAVY[:4]
     assert not [module for module in daemon if module.startswith(own)]
     assert {module for module in daemon if module.startswith("fusiond.app.commands.")} == {"fusiond.app.commands.run"}
+
+
+def test_no_exception_interrupts_an_import(monkeypatch: pytest.MonkeyPatch) -> None:
+    handlers = []
+    grammar = entry.parser
+
+    def parser(command: str | None = None) -> argparse.ArgumentParser:
+        handlers.append(signal.getsignal(signal.SIGINT))
+        return grammar(command)
+
+    monkeypatch.setattr(entry, "parser", parser)
+    assert entry.main(["check", "--config", "nowhere.toml"]) == 2
+    assert handlers == [signal.SIG_DFL]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_ignored_interrupt_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interrupts_end_at_once():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -75,6 +75,16 @@ def test_life_of_the_process(tmp_path: Path, manager: socket.socket) -> None:
     assert "Traceback" not in log
 
 
+def test_sigint_ends_the_start_at_once_and_raises_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "live.toml"
+    os.mkfifo(file)
+    command = [sys.executable, "-m", "fusiond", "run", "--config", str(file)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process, file.open("wb"):  # now it reads the file
+        process.send_signal(signal.SIGINT)
+        _, log = process.communicate(timeout=DEADLINE)
+    assert (process.returncode, log) == (-signal.SIGINT, "")
+
+
 def test_wrong_configuration_is_exit_code_2(tmp_path: Path) -> None:
     configuration(tmp_path, "udpin:14550")
     command = [sys.executable, "-m", "fusiond", "run", "--config", str(tmp_path / "live.toml")]

@@ -1,0 +1,62 @@
+"""What the installed service is made of: lock files with hashes, a manual page, the licences of all libraries."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from fusiond.app.commands import COMMANDS
+from tests.helpers.paths import ROOT
+
+PACKAGING = ROOT / "packaging"
+ENTRY = re.compile(r"([a-z0-9-]+)==([0-9.]+)((?: ;[^\\]*)?) \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)")
+LOCKS = {"requirements.txt": "dependencies", "build-requirements.txt": "requires"}
+
+
+def wanted(lock: str) -> list[str]:
+    """What pyproject.toml asks for."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    section = project["project"] if lock == "requirements.txt" else project["build-system"]
+    return list(section[LOCKS[lock]])
+
+
+@pytest.mark.parametrize("lock", LOCKS)
+def test_a_lock_names_everything_with_hashes_and_no_host(lock: str) -> None:
+    text = (PACKAGING / lock).read_text(encoding="utf-8")
+    assert ENTRY.sub("", text) == ""
+    versions = {name: version for name, version, *_ in ENTRY.findall(text)}
+    for requirement in wanted(lock):
+        name, _, least = requirement.partition(">=")
+        found = versions[name.lower()]
+        assert tuple(map(int, found.split("."))) >= tuple(map(int, least.split("."))), requirement
+
+
+def printed(script: str, *arguments: str) -> str:
+    command = [sys.executable, str(PACKAGING / script), *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+def test_the_manual_page_has_every_command_and_its_options() -> None:
+    page = printed("man_page.py")
+    for name in COMMANDS:
+        assert f".SS fusiond {name}\n" in page
+    assert "\\-\\-config C.toml" in page
+    requests = {line.split()[0] for line in page.splitlines() if line.startswith((".", "'"))}
+    assert requests == {".TH", ".SH", ".SS", ".TP", ".B", ".I", ".RI", ".BR", ".br"}
+
+
+def test_every_library_has_its_licence() -> None:
+    import numpy  # noqa: PLC0415 - for where the libraries lie
+
+    text = printed("licences.py", str(next(iter(numpy.__path__)).rpartition("/")[0]))
+    paragraphs = {}
+    for part in text.split("\n\n"):
+        if found := re.search(r"Comment:\n ([\w.-]+) [\d.]+", part):
+            paragraphs[re.sub("[-_.]+", "-", found[1]).lower()] = part
+    for name, *_ in ENTRY.findall((PACKAGING / "requirements.txt").read_text(encoding="utf-8")):
+        assert re.search(r"^License: (?!see).+", paragraphs[name], re.MULTILINE), name
+    assert "left out of this copy" in paragraphs["pymavlink"]
