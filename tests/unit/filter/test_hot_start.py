@@ -29,7 +29,7 @@ from fusiond.filter.state import (
     ResetReason,
     T,
 )
-from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, installation, to_text
+from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, installation, to_text, with_frame
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.streams import PULLS_AWAY_S, SECOND, T0, Drive, bits, config, drive, fuse, measurements, ramp
@@ -314,6 +314,10 @@ def test_both_kernels_agree() -> None:
 
 def test_text_and_back() -> None:
     assert from_text(to_text(stored())) == stored()
+    framed = with_frame(stored(), (48.1, 11.6, 520.25), 129)
+    assert from_text(to_text(framed)) == framed
+    with pytest.raises(StoredStateError, match="checksum"):
+        from_text(to_text(framed).replace(b"129", b"128"))
 
 
 def test_whatever_is_torn_or_altered_is_found() -> None:
@@ -325,8 +329,8 @@ def test_whatever_is_torn_or_altered_is_found() -> None:
         from_text(text.replace(b'"at_rest": true', b'"at_rest": false'))
     with pytest.raises(StoredStateError, match="torn or altered"):
         from_text(text.replace(b'"roll"', b'"rolled"'))
-    with pytest.raises(StoredStateError, match="its version is 1, not 2"):
-        from_text(text.replace(b'"version": 2', b'"version": 1'))
+    with pytest.raises(StoredStateError, match="its version is 2, not 3"):
+        from_text(text.replace(b'"version": 3', b'"version": 2'))
 
 
 def test_it_is_for_one_vehicle_as_it_is_configured() -> None:
