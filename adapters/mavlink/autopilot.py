@@ -67,6 +67,8 @@ def unfit(message: StateMessage, limits: Autopilot) -> tuple[str, str] | None:
     state = message.state
     if state is None or message.mode in (Mode.ALIGNING, Mode.LOST):
         return message.mode.value, message.fault or message.mode.value.replace("_", " ")
+    if not (message.heading_confirmed or limits.unconfirmed_heading):
+        return "heading", "nothing has confirmed the given or stored heading yet: drive"
     if message.mode is Mode.DEAD_RECKONING and not limits.dead_reckoning:
         return "dead_reckoning", "dead reckoning"
     if message.age_ms is None or message.age_ms > limits.age_ms:

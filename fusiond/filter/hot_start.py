@@ -18,10 +18,12 @@ from fusiond.filter.state import (
     FIX_E,
     FIX_VARIANCE,
     HOT_START,
+    NEVER,
     PHASE,
     RESETS,
     RUNNING,
     STORED,
+    T_FIRST_VELOCITY,
     FilterState,
     T,
     Verdict,
@@ -127,7 +129,14 @@ def leading(state: FilterState) -> FilterState:
     published, hypothesis = state.copy(), state.hypothesis(STORED)
     published.nominal[:], published.covariance[:] = hypothesis.nominal, hypothesis.covariance
     published.stamps[PHASE] = RUNNING
+    published.stamps[T_FIRST_VELOCITY] = NEVER
     return published
+
+
+def is_confirmed(state: FilterState) -> bool:
+    """Whether the drive or two antennas have confirmed the heading of a running filter. Until then it is the given or the
+    stored one."""
+    return bool(state.stamps[T_FIRST_VELOCITY] != NEVER)
 
 
 def _distance(stored: StoredState, fix_e: Array, lever_b: Array) -> float:

@@ -86,6 +86,9 @@ class StateAtInstant(Message, frozen=True, kw_only=True):
     ]
     resets: Annotated[int, _about("number of resets, that is jumps of the state")]
     fault: Annotated[str | None, _about("why the state was withheld; null otherwise")] = None
+    heading_confirmed: Annotated[
+        bool, _about("whether the drive or two antennas have confirmed the heading; before, it is given or stored")
+    ] = True
     state: Annotated[State | None, _about("the state; null while there is none")]
     outcomes: Annotated[OutcomeCounts, _about("outcomes of the measurements so far")]
 

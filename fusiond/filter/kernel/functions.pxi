@@ -1126,6 +1126,12 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
             (a + 21)[_i] = (a + 15)[_i]
         stamps[8] = t_ns
 
+cdef bint initial_alignment_tells_course(double* velocity_n, double variance, Parameters* params) noexcept nogil:
+    cdef double north
+    cdef double east
+    north, east = velocity_n[0], velocity_n[1]
+    return (variance <= (((north * north) + (east * east)) * (params.heading_variance - (0.03490658503988659 * 0.03490658503988659))))
+
 cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
     cdef int64_t first
     cdef double north
@@ -3242,6 +3248,8 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
     cdef int64_t phase
     cdef int64_t t_ns
     cdef int64_t model
+    cdef double* values
+    cdef bint tells
     cdef double grown
     stamps = state.stamps
     phase = (<int64_t>(state.stamps[10]))
@@ -3250,6 +3258,11 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
         return False
     if (phase == 1):
         return (model != 0 and model != 1)
+    if ((phase == 2) and (stamps[6] == (<int64_t>-4611686018427387904))):
+        values = row.values
+        tells = ((model == 1) and initial_alignment_tells_course(values, values[3], params))
+        if (tells or (model == 4)):
+            return False
     if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params)):
         if (not inertial_sample_is_believed(state, row.values, t_ns, params)):
             return True

@@ -217,7 +217,7 @@ def test_a_folder_in_its_place_is_reported(tmp_path: Path) -> None:
 
 # --- The local frame of an autopilot
 
-TO_AUTOPILOT = '[autopilot]\nlink = "fc"\n'
+TO_AUTOPILOT = '[autopilot]\nlink = "fc"\nunconfirmed_heading = true\n'
 
 
 def test_the_local_frame_goes_on_in_the_next_run(tmp_path: Path, bus: can.BusABC) -> None:

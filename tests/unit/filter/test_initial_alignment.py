@@ -39,7 +39,7 @@ from fusiond.filter.state import (
 from fusiond.filter.step import LOST_HEADING, yaw_variance
 from fusiond.maths.rotation import euler, matrix, matrix_from_euler, skew
 from tests.conftest import needs_compiled
-from tests.helpers.streams import MS, SECOND, T0, WHEELS, Drive, bits, config, drive, fuse, measurements
+from tests.helpers.streams import MS, PULLS_AWAY_S, SECOND, T0, WHEELS, Drive, bits, config, drive, fuse, measurements, ramp
 
 HEADING = 0.4  # rad
 GIVEN = {"heading_deg": math.degrees(HEADING), "heading_sigma_deg": 2.0}
@@ -220,6 +220,51 @@ def test_a_heading_that_the_course_contradicts_wins_in_reverse() -> None:
     truth = drive(10.0, lambda t: -10.0 - 2.0 * np.sin(t), lambda t: HEADING + 0.1 * t, rate=50.0)
     fusion = fuse(config(filter=GIVEN), measurements(truth), True)
     assert attitude(fusion)[2] == pytest.approx(math.degrees(HEADING + 1.0), abs=2.0)
+
+
+def pulling_away(turned: float, speed: float, seconds: float = 12.0) -> list[Measurement]:
+    """Stands for 3 s, then drives off with a heading so far from the given one."""
+    curve = lambda t: speed * ramp(t, PULLS_AWAY_S, 4.0)  # noqa: E731
+    truth = drive(seconds, curve, lambda t: HEADING + turned + 0.2 * np.sin(0.5 * t) * ramp(t, 3.0, 3.0), rate=50.0)
+    return measurements(truth)
+
+
+def confirmed(fusion: Fusion) -> bool:
+    return fusion.solution_at(int(fusion.history.head.stamps[T])).heading_confirmed
+
+
+def test_a_given_heading_is_confirmed_by_the_drive(compiled: bool) -> None:
+    """Also below the speed of a course; at rest nothing confirms it."""
+    fusion, events = Fusion(config(filter=GIVEN), compiled), pulling_away(0.05, 3.0, 6.0)
+    for event in events:
+        fusion.fuse(event)
+        if event.t_ns == T0 + PULLS_AWAY_S * SECOND:
+            assert fusion.history.head.stamps[PHASE] == RUNNING and not confirmed(fusion)
+    assert confirmed(fusion)
+    assert fusion.history.head.stamps[RESETS] == 0
+
+
+@needs_compiled
+@pytest.mark.parametrize("turned_deg", [60.0, 144.0, 180.0])
+def test_a_given_heading_that_the_drive_contradicts_is_dropped(turned_deg: float) -> None:
+    """It is never called confirmed, and soon after the speed of a course the right one is known."""
+    fusion = Fusion(config(filter=GIVEN), True)
+    for event in pulling_away(math.radians(turned_deg), 14.0, 14.0):
+        fusion.fuse(event)
+        if event.source == "gps0.velocity" and confirmed(fusion):
+            off = attitude(fusion)[2] - math.degrees(HEADING) - turned_deg
+            assert abs((off + 180) % 360 - 180) < 25.0  # it weaves by 11 deg
+    assert confirmed(fusion)
+    head = fusion.history.head
+    assert (head.stamps[RESETS], head.stamps[RESET_REASON]) == (1, ResetReason.HEADING_DECIDED)
+
+
+@needs_compiled
+def test_both_kernels_prove_a_heading_alike() -> None:
+    events = pulling_away(math.radians(144.0), 14.0, 8.0)
+    one, other = (fuse(config(filter=GIVEN), events, compiled).history.head for compiled in (True, False))
+    np.testing.assert_array_equal(one.whole, other.whole)
+    np.testing.assert_array_equal(bits(one.numbers), bits(other.numbers))
 
 
 @pytest.mark.parametrize("sigma_deg", [9.0, 15.0, 24.0, 40.0, 1e5])

@@ -213,6 +213,16 @@ def test_dead_reckoning_is_sent_only_if_wanted(tmp_path: Path) -> None:
         assert ("ODOMETRY" in link.kinds()) is wanted
 
 
+def test_a_heading_that_nothing_has_confirmed_is_sent_only_if_wanted(tmp_path: Path) -> None:
+    for wanted in (True, False):
+        output, link = made(tmp_path, f"{ON}unconfirmed_heading = {str(wanted).lower()}\n")
+        output.offer(msgspec.structs.replace(state_at(10**18), heading_confirmed=False))
+        assert ("ODOMETRY" in link.kinds()) is wanted
+        assert ("drive" in output.notes()["sending"]) is not wanted
+        output.offer(state_at(10**18 + 100 * MS))
+        assert "ODOMETRY" in link.kinds()
+
+
 def test_the_origin_is_that_of_the_first_fit_state(tmp_path: Path) -> None:
     output, link = made(tmp_path, ON)
     output.offer(state_at(10**18 - 400 * MS, 0, mode=Mode.LOST))
