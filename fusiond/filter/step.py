@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 from fusiond.filter import gnss_error, heading_bank, inertial_sample, initial_alignment, source_health
+from fusiond.filter.hot_start import has_state
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, roll, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, GNSS_YAW, IMU, WHEEL_SPEED, gnss_velocity
@@ -87,6 +88,7 @@ def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> N
             if coasted and not lost:
                 roll(state, params)
         guard(state)
+    _name_gathered(state, row, params)
     state.source_stamps[source, T_LAST] = t_ns
 
 
@@ -138,6 +140,7 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
             keep_sample(state, row, params)
             constrain(state, params)
         guard(state)
+    _name_gathered(state, row, params)
     state.source_stamps[source, T_LAST] = t_ns
 
 
@@ -176,6 +179,13 @@ def _forget_judgement(row: Row) -> None:
     row["ratio"] = 0.0
     row["innovation"][:] = 0.0
     row["variance"][:] = 0.0
+
+
+@compiled
+def _name_gathered(state: FilterState, row: Row, params: Parameters) -> None:
+    """What was taken in is not fused where there is no state that it went into."""
+    if row["outcome"] == Outcome.FUSED and not has_state(state, params):
+        row["outcome"] = Outcome.GATHERED
 
 
 @compiled

@@ -830,6 +830,16 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 4] = (<int64_t>-4611686018427387904)
 
+# ---------------- fusiond.filter.hot_start
+
+cdef bint hot_start_leads(State* state, Parameters* params) noexcept nogil:
+    if ((state.stamps[10] != 3) or (state.stamps[21] != 1)):
+        return False
+    return (state.bank[(12) * BLOCK + 0] >= 0.5)
+
+cdef bint hot_start_has_state(State* state, Parameters* params) noexcept nogil:
+    return ((state.stamps[10] == 2) or hot_start_leads(state, params))
+
 # ---------------- fusiond.filter.inertial_sample
 
 cdef (double, double, double, double) inertial_sample_compare(State* state, double* values, double elapsed, Parameters* params) noexcept nogil:
@@ -3241,6 +3251,7 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
             if (coasted and (not lost)):
                 motion_constraints_roll(state, params)
         step_guard(state)
+    step__name_gathered(state, row, params)
     state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
 
 cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nogil:
@@ -3277,6 +3288,10 @@ cdef void step__forget_judgement(Row* row) noexcept nogil:
         row.innovation[_i] = 0.0
     for _i in range(3):
         row.variance[_i] = 0.0
+
+cdef void step__name_gathered(State* state, Row* row, Parameters* params) noexcept nogil:
+    if ((row.outcome == 0) and (not hot_start_has_state(state, params))):
+        row.outcome = 6
 
 cdef bint step__fuse_while_lost(State* state, Row* row, Parameters* params, double variance) noexcept nogil:
     cdef bint fused

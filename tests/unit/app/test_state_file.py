@@ -128,15 +128,16 @@ def test_a_torn_file_is_a_cold_start(tmp_path: Path, bus: can.BusABC, caplog: py
     file.write_bytes(torn)
     settings(tmp_path, port, bus)
     with caplog.at_level(logging.WARNING, "fusiond"), running(without_heading(tmp_path)) as run:
-        stand(run, port, bus, lambda: run.daemon.health is not None and fused(run) > 100)
+        stand(run, port, bus, lambda: run.daemon.health is not None and gathered(run) > 100)
         assert last(run) is Mode.ALIGNING
         assert "ignored: torn or altered" in note(run)
+        assert run.daemon.live.engine.fusion.totals()["FUSED"] == 0  # there was no state to go into
     assert sum("stored state ignored" in record.message for record in caplog.records) == 1
     assert file.read_bytes() == torn  # there was no better state
 
 
-def fused(run: Running) -> int:
-    return run.daemon.live.engine.fusion.totals()["FUSED"]
+def gathered(run: Running) -> int:
+    return run.daemon.live.engine.fusion.totals()["GATHERED"]
 
 
 def test_a_full_disk_is_counted_and_stops_nothing(
