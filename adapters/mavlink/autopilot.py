@@ -3,7 +3,8 @@
 Messages go out on the open link of a MAVLink input, from this output's own thread. Only a state within the configured
 limits is sent; if one is not, the health and a STATUSTEXT give the reason. Whether the autopilot uses the state is read
 from its EKF_STATUS_REPORT or ESTIMATOR_STATUS, which the link requests (see `housekeeping`), and from the STATUSTEXTs of
-ArduPilot's EKF3: "is using external nav data", "stopped aiding".
+ArduPilot's EKF3: "is using external nav data", "stopped aiding". It is asked for the origin of its local frame, which then
+is that of the positions sent (see `shared_frame`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from fusiond.config.outputs import Autopilot
 from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import State, StateMessage
-from fusiond.ports.outputs import POLL_S, Outbox
+from fusiond.ports.outputs import POLL_S, KeptFrame, Outbox
 from fusiond.units import SECOND
 from fusiond_adapters.mavlink.answers import Parameter
 from fusiond_adapters.mavlink.decoder import message_id
@@ -35,14 +36,15 @@ from fusiond_adapters.mavlink.outgoing import (
     status_texts,
     vision_position,
 )
+from fusiond_adapters.mavlink.shared_frame import SharedFrame
 
 OUTBOX = 64  # messages
 MIN_HZ = 4.0  # below this rate ArduPilot stops using the data
 MAX_AGE_NS = SECOND  # an older state is not sent
 MAX_STATUS_AGE_NS = 5 * SECOND  # an older estimator status is ignored
 TEXT_NS = 5 * SECOND  # between two STATUSTEXTs
-ORIGIN_NS = 2 * SECOND  # between two SET_GPS_GLOBAL_ORIGINs, until the autopilot reports its origin
-ORIGIN_APART_M = 1.0  # a larger distance between the autopilot's origin and ours is reported
+ORIGIN_NS = 2 * SECOND  # between two requests for the autopilot's origin, and two that it take ours, until it reports one
+ORIGIN_AGAIN_NS = 10 * SECOND  # between two requests from then on: it may get another when it reboots
 GATE = 1.0  # of a test ratio
 ARDUPILOT_UNINITIALISED = 1024  # EKF_STATUS_FLAGS; in ESTIMATOR_STATUS the bit means a GPS glitch
 HAS_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
@@ -54,6 +56,7 @@ READ = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT,
     dialect.MAVLINK_MSG_ID_STATUSTEXT,
     dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+    dialect.MAVLINK_MSG_ID_GPS_RAW_INT,
     dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
 }
@@ -64,6 +67,8 @@ def unfit(message: StateMessage, limits: Autopilot) -> tuple[str, str] | None:
     state = message.state
     if state is None or message.mode in (Mode.ALIGNING, Mode.LOST):
         return message.mode.value, message.fault or message.mode.value.replace("_", " ")
+    if not (message.heading_confirmed or limits.unconfirmed_heading):
+        return "heading", "nothing has confirmed the given or stored heading yet: drive"
     if message.mode is Mode.DEAD_RECKONING and not limits.dead_reckoning:
         return "dead_reckoning", "dead reckoning"
     if message.age_ms is None or message.age_ms > limits.age_ms:
@@ -94,6 +99,7 @@ class Readback:
 
     def __init__(self, link: MavlinkLink, kind: str) -> None:
         self.origin: Origin | None = None  # of its local frame; its height is above the sea
+        self.undulation_m = 0.0  # of the geoid, by its receiver; 0 where that gives only heights above the sea
         self._link, self._kind = link, kind
         self._parser = dialect.MAVLink(None)
         self._actual_kind = kind  # according to its heartbeat
@@ -111,6 +117,15 @@ class Readback:
         if (message.get_srcSystem(), message.get_srcComponent()) != self._link.housekeeping.target:
             return
         kind = message.get_msgId()
+        if kind == dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
+            self.origin = Origin(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+        elif kind == dialect.MAVLINK_MSG_ID_GPS_RAW_INT:
+            if message.alt_ellipsoid:
+                self.undulation_m = (message.alt_ellipsoid - message.alt) / 1e3
+        else:
+            self._receive_status(message, kind, t_ns)
+
+    def _receive_status(self, message: Any, kind: int, t_ns: int) -> None:
         if kind == dialect.MAVLINK_MSG_ID_HEARTBEAT:
             self._actual_kind = NAMES.get(message.autopilot, self._kind)
         elif kind == dialect.MAVLINK_MSG_ID_STATUSTEXT:
@@ -118,8 +133,6 @@ class Readback:
                 self._uses_external = True
             elif STOPPED_AIDING.search(message.text):
                 self._uses_external = False
-        elif kind == dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
-            self.origin = Origin(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
         elif kind == dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
             flags = message.flags & ~ARDUPILOT_UNINITIALISED
             if message.flags & ARDUPILOT_UNINITIALISED:
@@ -159,20 +172,23 @@ class AutopilotOutput:
 
     name = "autopilot"
 
-    def __init__(self, config: Config, link: MavlinkLink, now: Callable[[], int]) -> None:
-        self._settings, self._geoid_m = config.autopilot, config.vehicle.geoid_m
+    def __init__(
+        self, config: Config, link: MavlinkLink, now: Callable[[], int], kept: KeptFrame | None = None
+    ) -> None:
+        """`kept` is the local frame of the last run."""
+        self._settings, self._configured_geoid_m = config.autopilot, config.vehicle.geoid_m
         self._link, self._now = link, now
         self._conventions = CONVENTIONS[self._settings.kind]
         self.outbox = Outbox(OUTBOX, (StateMessage,))
         self.about = f"{self._settings.message} to {self._settings.kind} over MAVLink {self._settings.link}"
         self.limiter, self._max_hz = RateLimiter(self._settings.rate_hz), config.publish.rate_hz
         self.readback = Readback(link, self._settings.kind)
-        self.origin: Origin | None = None  # of the local frame: the first fit position, kept
+        self.frame = SharedFrame(KeptFrame() if kept is None else kept, self._conventions.project, now())
         self._counts = dict.fromkeys(("sent", "not fit", "stale", "link closed or full"), 0)
         self._unfit: tuple[str, str] | None = ("none", "no state yet")
         self._passed = True  # the link accepted the last one
         self._reported = "none"  # kind of reason in the last STATUSTEXT
-        self._texts, self._next_text_ns, self._next_origin_ns = 0, 0, 0
+        self._texts, self._next_text_ns, self._next_origin_ns, self._ask_origin_ns = 0, 0, 0, 0
 
     def session(self, stop: Event) -> None:
         """Send states until `stop` is set. The link's input opens and closes it; states while it is closed are lost and
@@ -180,6 +196,7 @@ class AutopilotOutput:
         self._link.listeners.append(self.readback.receive)
         try:
             while not stop.is_set():
+                self.ask_for_origin()
                 for message in self.outbox.take(POLL_S):
                     if isinstance(message, StateMessage):
                         self.offer(message)
@@ -198,20 +215,35 @@ class AutopilotOutput:
         if self._unfit or message.state is None:
             self._counts["not fit"] += 1
             return
-        if self.origin is None:
-            self.origin = Origin.of(message.state)
+        origin = self.frame.at(message.state, self.readback.origin, self._geoid_m)
         if self._settings.set_origin and self.readback.origin is None and message.t_ns >= self._next_origin_ns:
             self._next_origin_ns = message.t_ns + ORIGIN_NS
-            self._link.send(set_origin(message, self.origin, self._geoid_m, (self._link.housekeeping.target or (0, 0))[0]))
-        self._passed = self._link.send(self._packed(message, message.state, self.origin))
+            self._link.send(set_origin(message, origin, self._geoid_m, (self._link.housekeeping.target or (0, 0))[0]))
+        self._passed = self._link.send(self._packed(message, message.state, origin))
         self._counts["sent" if self._passed else "link closed or full"] += 1
+
+    def ask_for_origin(self) -> None:
+        """Request GPS_GLOBAL_ORIGIN when that is due. An autopilot without an origin does not send it."""
+        target, now = self._link.housekeeping.target, self._now()
+        if target is None or self._settings.message == "gps_input" or now < self._ask_origin_ns:
+            return
+        self._ask_origin_ns = now + (ORIGIN_NS if self.readback.origin is None else ORIGIN_AGAIN_NS)
+        self._link.send(dialect.MAVLink_command_long_message(
+            *target, dialect.MAV_CMD_REQUEST_MESSAGE, 0, dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, 0, 0, 0, 0, 0, 0,
+        ))  # fmt: skip
+
+    @property
+    def _geoid_m(self) -> float:
+        """Height of the geoid above the ellipsoid: as configured, or else by the autopilot's receiver."""
+        return self._configured_geoid_m or self.readback.undulation_m
 
     def _packed(self, message: StateMessage, state: State, origin: Origin) -> Any:
         if self._settings.message == "gps_input":
             return gps_input(message, state, self._geoid_m, self._settings.gps_id)
         if self._settings.message == "vision_position":
-            return vision_position(message, state, origin, self._conventions)
-        return odometry(message, state, origin, self._conventions, quality(state, self._settings))
+            return vision_position(message, state, origin, self._conventions, self.frame.count(message.resets))
+        worth = quality(state, self._settings)
+        return odometry(message, state, origin, self._conventions, worth, self.frame.count(message.resets))
 
     def _report(self, t_ns: int) -> None:
         """Report by STATUSTEXT whether states are sent from now on, at most once in TEXT_NS."""
@@ -237,14 +269,10 @@ class AutopilotOutput:
         return dict(self._counts)
 
     def notes(self) -> dict[str, str]:
-        """Whether states are sent, whether the autopilot uses them, and the origin of its local frame if it is not ours."""
+        """Whether states are sent, whether the autopilot uses them, and whose origin their local frame has."""
         unfit_now = self._unfit
         reason = unfit_now[1] if unfit_now else "" if self._passed else "the link is closed or full"
         notes = {"sending": f"no: {reason}" if reason else "yes", "used": self.readback.verdict(self._now())}
-        theirs, ours = self.readback.origin, self.origin
-        if theirs and ours:
-            north, east = self._conventions.project(ours, theirs.latitude_deg, theirs.longitude_deg)
-            apart = (north * north + east * east) ** 0.5
-            if apart > ORIGIN_APART_M and self._settings.message != "gps_input":
-                notes["origin"] = f"the autopilot's local frame begins {apart:.1f} m from ours"
+        if self.frame.origin is not None and self._settings.message != "gps_input":
+            notes["origin"] = "the autopilot's" if self.frame.is_reported else "our own: the autopilot reports none"
         return notes

@@ -113,7 +113,9 @@ CONVENTIONS = {
 }
 
 
-def odometry(message: StateMessage, state: State, origin: Origin, conventions: Conventions, quality: int) -> Any:
+def odometry(
+    message: StateMessage, state: State, origin: Origin, conventions: Conventions, quality: int, reset_counter: int
+) -> Any:
     """ODOMETRY: pose in the local frame, velocity and angular rate in body axes. `quality` is 1 to 100."""
     mat_nb = matrix(np.array(state.quaternion_nb))
     twist = mat_nb.T @ _square(state.covariance_velocity_m2ps2) @ mat_nb
@@ -123,15 +125,17 @@ def odometry(message: StateMessage, state: State, origin: Origin, conventions: C
         *local_position(state, origin, conventions.project), list(state.quaternion_nb),
         *(mat_nb.T @ state.velocity_ned_mps).tolist(), *state.angular_rate_b_rps,
         _upper(_square(state.covariance_position_m2), _euler_covariance(state)), _upper(twist, rates),
-        message.resets & 0xFF, common.MAV_ESTIMATOR_TYPE_VIO, quality)  # fmt: skip
+        reset_counter, common.MAV_ESTIMATOR_TYPE_VIO, quality)  # fmt: skip
 
 
-def vision_position(message: StateMessage, state: State, origin: Origin, conventions: Conventions) -> Any:
+def vision_position(
+    message: StateMessage, state: State, origin: Origin, conventions: Conventions, reset_counter: int
+) -> Any:
     """VISION_POSITION_ESTIMATE."""
     covariance = _upper(_square(state.covariance_position_m2), _euler_covariance(state))
     return common.MAVLink_vision_position_estimate_message(
         message.t_ns // MICROSECOND, *local_position(state, origin, conventions.project), *_euler(state), covariance,
-        message.resets & 0xFF,
+        reset_counter,
     )
 
 

@@ -17,7 +17,7 @@ def make(config: Config, context: OutputContext) -> Sequence[LiveOutput]:
     if config.autopilot.link is not None:
         from fusiond_adapters.mavlink.autopilot import AutopilotOutput  # noqa: PLC0415 - loads another dialect
 
-        autopilot = AutopilotOutput(config, link_of(context.inputs, config.autopilot.link), now)
+        autopilot = AutopilotOutput(config, link_of(context.inputs, config.autopilot.link), now, context.frame)
         parameters = [autopilot.parameter()]
         made.append(autopilot)
     if config.ground_station.link is not None or config.ground_station.connection is not None:

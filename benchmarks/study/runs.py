@@ -39,6 +39,7 @@ from fusiond.filter.state import (
     RUNNING,
     SCALE,
     T_CONSTRAINT,
+    T_FIRST_VELOCITY,
     T_IMU,
     T_POSITION,
     T_START,
@@ -127,7 +128,7 @@ def started(fusion: Fusion, world: World, random: np.random.Generator) -> None:
     state.covariance[:] = covariance
     state.auxiliary[HELD_FORCE_B] = state.auxiliary[FORCE_B] = world.accel[0]
     state.auxiliary[HELD_RATE_B] = state.auxiliary[RATE_B] = world.gyro[0]
-    state.stamps[[T, T_IMU, T_CONSTRAINT, T_POSITION, T_START]] = T0
+    state.stamps[[T, T_IMU, T_CONSTRAINT, T_POSITION, T_START, T_FIRST_VELOCITY]] = T0
     watch(state, world.accel[0], world.gyro[0], 1 / world.sensor.rate_hz, fusion.params)
     state.stamps[PHASE] = RUNNING
     history = fusion.history

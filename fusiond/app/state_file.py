@@ -9,8 +9,17 @@ from pathlib import Path
 from fusiond.config.schema import Config
 from fusiond.filter.hot_start import WORDS
 from fusiond.filter.state import Verdict
-from fusiond.filter.stored_state import DamagedStateError, StoredState, StoredStateError, check, from_text, to_text
+from fusiond.filter.stored_state import (
+    DamagedStateError,
+    StoredState,
+    StoredStateError,
+    check,
+    from_text,
+    to_text,
+    with_frame,
+)
 from fusiond.messages.types import OutputHealth
+from fusiond.ports.outputs import KeptFrame
 
 MAX_BYTES = 1_000_000  # a larger file was not written by fusiond
 
@@ -33,10 +42,11 @@ def read_state(path: Path) -> StoredState | None:
 
 class StateFile:
     """Reads the stored state of the last run, and writes new ones. A reader of the file finds the old state or the new one,
-    never a part."""
+    never a part. The local frame of an autopilot is kept with it, and is of use where the state itself is not."""
 
     def __init__(self, path: Path, config: Config, now_ns: int) -> None:
         self.stored: StoredState | None = None  # of the last run, if it can be used
+        self.frame = KeptFrame()  # of the last run; an output goes on with it
         self.written = self.lost = 0
         self.error: str | None = None  # the last one, until a write succeeds
         self._path = path
@@ -45,6 +55,8 @@ class StateFile:
         try:
             stored = read_state(path)
             if stored is not None:
+                if stored.vehicle == config.vehicle.name:
+                    self.frame = KeptFrame(stored.origin, stored.reset_counter)
                 check(stored, config, now_ns)
                 self.stored = stored
         except StoredStateError as error:
@@ -71,9 +83,9 @@ class StateFile:
         return OutputHealth(offered=self.written + self.lost, dropped=self.lost, counts={}, notes=notes)
 
     def write(self, stored: StoredState) -> None:
-        """Replace the file durably. A failure is counted, and leaves the file as it was."""
+        """Replace the file durably, with the local frame of now. A failure is counted, and leaves the file as it was."""
         try:
-            self._replace(to_text(stored))
+            self._replace(to_text(with_frame(stored, self.frame.origin, self.frame.reset_counter)))
         except OSError as error:
             self.lost += 1
             self.error = error.strerror or str(error)

@@ -107,6 +107,7 @@ class Autopilot(Section, frozen=True, kw_only=True):
     velocity_sigma_mps: Positive = 1.0  # nor beyond this velocity sigma
     yaw_sigma_deg: Positive = 15.0  # nor beyond this yaw sigma
     age_ms: Positive = 500.0  # nor when the last IMU sample is older
+    unconfirmed_heading: bool = False  # send while nothing but a given or stored heading is known: at rest, to arm
     set_origin: bool = False  # send the local origin to the autopilot while it has none of its own
     gps_id: Annotated[int, Meta(ge=0, le=1)] = 1  # the receiver that gps_input stands for: 0 is the first, 1 the second
 

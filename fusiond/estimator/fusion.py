@@ -13,7 +13,7 @@ from fusiond.config.schema import Config, Imu
 from fusiond.estimator.history import History
 from fusiond.estimator.solution import COVARIANCE_SIZE, Mode, Solution, SolutionState
 from fusiond.events import ImuSample, Invalid, Measurement, Received, Vector3
-from fusiond.filter.hot_start import leading, leads
+from fusiond.filter.hot_start import is_confirmed, leading, leads
 from fusiond.filter.kernel.interpreted import AnyKernel
 from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations import IMU, MODELS
@@ -193,7 +193,7 @@ class Fusion:
         stamps, resets = state.stamps, int(state.stamps[RESETS])
         age = None if stamps[T_IMU] == NEVER else t_ns - int(stamps[T_IMU])
         if stamps[PHASE] != RUNNING:
-            return Solution(t_ns, Mode.ALIGNING, age, resets, None)
+            return Solution(t_ns, Mode.ALIGNING, age, resets, None, False)
         published = solution_state(state, self.history.kernel)
         north, east, _ = published.sigma_position_n()
         mode = Mode.NOMINAL
@@ -201,7 +201,7 @@ class Fusion:
             mode = Mode.LOST
         elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.params.filter.position_timeout_s):
             mode = Mode.DEAD_RECKONING
-        return Solution(t_ns, mode, age, resets, published)
+        return Solution(t_ns, mode, age, resets, published, is_confirmed(state))
 
 
 def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:

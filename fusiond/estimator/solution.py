@@ -94,6 +94,7 @@ class Solution:
     age_ns: int | None  # t_ns less the stamp of the last IMU sample used; None before the first sample
     resets: int  # number of resets so far; the state may jump at each
     state: SolutionState | None
+    heading_confirmed: bool = True  # by the drive or two antennas; until then it is the given or the stored one
 
 
 def _half_open(angle: float) -> float:

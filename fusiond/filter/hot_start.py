@@ -18,10 +18,12 @@ from fusiond.filter.state import (
     FIX_E,
     FIX_VARIANCE,
     HOT_START,
+    NEVER,
     PHASE,
     RESETS,
     RUNNING,
     STORED,
+    T_FIRST_VELOCITY,
     FilterState,
     T,
     Verdict,
@@ -29,7 +31,7 @@ from fusiond.filter.state import (
 from fusiond.filter.stored_state import StoredState
 from fusiond.maths.portable import square
 from fusiond.maths.rotation import matrix_from_euler, product
-from fusiond.maths.typed import Array
+from fusiond.maths.typed import Array, compiled
 from fusiond.maths.wgs84 import ecef, mat_ne
 
 USED_WEIGHT = 0.8  # of the stored heading where all agrees: it takes evidence, not chance, to collapse the bank on it
@@ -117,11 +119,18 @@ def heading(
     return Heading(stored.yaw, max(sigma, DOUBTED_SIGMA), DOUBTED_WEIGHT), Verdict.DOUBTED
 
 
+@compiled
 def leads(state: FilterState, params: Parameters) -> bool:
     """Whether a bank is so sure of the stored heading that its state is published."""
     if state.stamps[PHASE] != CHOOSING or state.stamps[HOT_START] != Verdict.USED:
         return False
-    return bool(state.bank[STORED, 0] >= LEADS)
+    return state.bank[STORED, 0] >= LEADS
+
+
+@compiled
+def has_state(state: FilterState, params: Parameters) -> bool:
+    """Whether there is a state that is published: the filter runs, or the stored heading leads."""
+    return state.stamps[PHASE] == RUNNING or leads(state, params)
 
 
 def leading(state: FilterState) -> FilterState:
@@ -129,7 +138,14 @@ def leading(state: FilterState) -> FilterState:
     published, hypothesis = state.copy(), state.hypothesis(STORED)
     published.nominal[:], published.covariance[:] = hypothesis.nominal, hypothesis.covariance
     published.stamps[PHASE] = RUNNING
+    published.stamps[T_FIRST_VELOCITY] = NEVER
     return published
+
+
+def is_confirmed(state: FilterState) -> bool:
+    """Whether the drive or two antennas have confirmed the heading of a running filter. Until then it is the given or the
+    stored one."""
+    return bool(state.stamps[T_FIRST_VELOCITY] != NEVER)
 
 
 def _distance(stored: StoredState, fix_e: Array, lever_b: Array) -> float:

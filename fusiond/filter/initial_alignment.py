@@ -87,12 +87,13 @@ from fusiond.filter.state import (
     WIDE_SIZE,
     FilterState,
     T,
+    Verdict,
 )
 from fusiond.filter.stored_state import StoredState
 from fusiond.filter.strapdown import end_coasting
 from fusiond.maths.portable import atan2, exp, sin_cos, square
-from fusiond.maths.rotation import cross, matrix, matrix_from_euler, product, quaternion, skew
-from fusiond.maths.typed import Array, compiled
+from fusiond.maths.rotation import cross, euler, matrix, matrix_from_euler, product, quaternion, skew
+from fusiond.maths.typed import Array, Vector, compiled
 from fusiond.maths.wgs84 import EQUATOR_GRAVITY, geodetic_trig, mat_ne, mat_ne_from_trig
 from fusiond.units import SECOND
 
@@ -106,6 +107,7 @@ REST_BIAS_SIGMA = math.radians(0.05)  # rad/s, gyro bias from the mean of a stan
 ALL_ROUND = 12  # hypotheses of an unknown heading
 COURSE_SIGMA = math.radians(2.0)  # rad, body against course: side slip and a careless mount
 CONTRADICTED_WEIGHT = 0.5  # of a course that contradicts the given heading, in the bank that decides between them
+MOVING_WEIGHT = 0.5  # of a given heading where the vehicle moves at the start, too slowly for a course
 OWN_ACCELERATION = 1.0  # m/s^2, sigma of the vehicle's own, over half a second, where nothing tells it
 WRAPS = 4  # rounds of the circle either way that such a heading reaches
 MAX_SPREAD = 2 * math.pi  # rad: a heading less certain than this is none
@@ -172,8 +174,7 @@ def gather_motion(state: FilterState, row: Row, params: Parameters) -> None:
 
 
 def _start_by_position(state: FilterState, source: int, params: Parameters) -> None:
-    """Start at rest; or in motion, where the heading is given or the receiver gives no velocity, with a velocity of which
-    only the bound is known."""
+    """Start at rest; or in motion, where the receiver gives no velocity, with one of which only the bound is known."""
     speed = _gnss_speed(state)
     if not _leveled(state) or speed >= params.course_speed:
         return
@@ -181,7 +182,7 @@ def _start_by_position(state: FilterState, source: int, params: Parameters) -> N
         _start(state, source, None, params.constraints[ZERO_VELOCITY, zero_velocity.VARIANCE], None, params)
         return
     heard_ns = state.stamps[T] - state.source_stamps[source, T_BACK]
-    if _is_sure(_given(state, params), params) or (math.isnan(speed) and heard_ns >= MAX_WINDOW_NS):
+    if math.isnan(speed) and heard_ns >= MAX_WINDOW_NS:
         _start(state, source, None, square(params.filter.v_max_mps / 3), None, params)
 
 
@@ -199,8 +200,7 @@ def _gather_velocity(state: FilterState, source: int, values: Array, params: Par
         return
     variance, course = values[gnss_velocity.VARIANCE], None
     if speed >= params.course_speed:
-        sigma = math.sqrt(variance / square(speed) + square(COURSE_SIGMA))
-        course = atan2(velocity_n[1], velocity_n[0]), sigma
+        course = _course(values)
     elif stamps[T_STILL] != NEVER:
         return  # the next position starts it
     _start(state, source, velocity_n, variance, course, params)
@@ -211,6 +211,34 @@ def _given(state: FilterState, params: Parameters) -> Heading | None:
     if params.filter.heading_deg is None or state.stamps[RESETS]:
         return None
     return math.radians(params.filter.heading_deg), math.radians(params.filter.heading_sigma_deg)
+
+
+def _course(values: Array) -> Heading:
+    """The course of a GNSS velocity, and its sigma as a heading [rad]."""
+    north, east = float(values[gnss_velocity.VELOCITY_N.start]), float(values[gnss_velocity.VELOCITY_N.start + 1])
+    spread = values[gnss_velocity.VARIANCE] / (square(north) + square(east))
+    return atan2(east, north), math.sqrt(spread + square(COURSE_SIGMA))
+
+
+@compiled
+def tells_course(velocity_n: Vector, variance: float, params: Parameters) -> bool:
+    """Whether a GNSS velocity, north and east first, is fast enough for a course as good as a heading must be."""
+    north, east = velocity_n[0], velocity_n[1]
+    return variance <= (north * north + east * east) * (params.heading_variance - COURSE_SIGMA * COURSE_SIGMA)
+
+
+def prove(state: FilterState, values: Array, params: Parameters) -> bool:
+    """Compare a heading that was only given with the course of a GNSS velocity. Where they agree it is confirmed. False
+    where they contradict each other at a speed at which the vehicle never reverses."""
+    course, x = _course(values), state.nominal
+    to_n = mat_ne(x[POSITION_E])
+    yaw = euler(product(to_n, matrix(x[QUATERNION_EB])))[2]
+    sigma = math.sqrt(float(to_n[2] @ state.covariance[ATTITUDE, ATTITUDE] @ to_n[2]))
+    if not _contradict((yaw, sigma), course, params):
+        state.stamps[T_FIRST_VELOCITY] = state.stamps[T]
+        return True
+    north, east = values[gnss_velocity.VELOCITY_N][:2]
+    return bool(math.sqrt(square(north) + square(east)) < params.course_speed)
 
 
 def _is_sure(heading: Heading | None, params: Parameters) -> bool:
@@ -246,24 +274,37 @@ def _start(
     params: Parameters,
 ) -> None:
     """Start from what was gathered: with a velocity (3,) [m/s], or None where it was not measured, and its variance; with
-    the given heading where that is sure, else with the course; and where there is neither, or they contradict each other,
-    with a bank of hypotheses."""
-    given, known = _given(state, params), course
-    apart = given is not None and course is not None and _contradict(given, course, params)
-    if given is not None and _is_sure(given, params):
-        known = given
+    the given heading where that is sure and the vehicle does not move or the course agrees, else with the course; and where
+    there is neither, or they contradict each other, with a bank of hypotheses. A given heading tells how the vehicle stood
+    when it was configured: one that was stored later, and contradicts it, is preferred; a start in motion tries it among
+    others."""
+    given, known, rests = _given(state, params), course, measured_n is None and _rests(state, params)
+    slow = rests if measured_n is None else not tells_course(measured_n, variance, params)
     stored, verdict = hot_start.recall(state, params)
+    kept: hot_start.Heading | None = None
+    if stored is not None and course is None:
+        level = _level(state, None, 0.0) if rests else None
+        kept, verdict = hot_start.heading(stored, state, source, level, params)
+    if given is not None and kept is not None and _contradict(given, (kept.yaw, kept.sigma), params):
+        given = None
+    apart = given is not None and course is not None and _contradict(given, course, params)
+    sure = given is not None and _is_sure(given, params)
+    if sure and (slow or course is not None):
+        known = given
     first = _first_variances(state, stored, params)
     if known is not None and not apart:
         _place(state, source, measured_n, variance, known, first, params)
         state.stamps[PHASE] = RUNNING
+        if stored is not None:
+            verdict = Verdict.OTHERWISE_KNOWN
     else:
         other, weight = course, CONTRADICTED_WEIGHT if course is not None else 0.0
-        if stored is not None and course is None:
-            level = _level(state, None, 0.0) if measured_n is None and _rests(state, params) else None
-            kept, verdict = hot_start.heading(stored, state, source, level, params)
-            if kept is not None:
-                other, weight = (kept.yaw, kept.sigma), _weight_of(kept, given)
+        if kept is not None:
+            other, weight = (kept.yaw, kept.sigma), _weight_of(kept, given)
+        elif sure and not apart:
+            other, weight = given, MOVING_WEIGHT
+        if sure and not apart:
+            given = None  # nothing around it: it may be wrong altogether
         hypotheses = _all_round(given, 1.0 - weight)
         if other is not None:
             hypotheses[STORED] = other, weight
@@ -275,6 +316,8 @@ def _start(
         state.stamps[PHASE] = CHOOSING
     if verdict:
         state.stamps[HOT_START] = verdict
+    told = course is not None or (state.stamps[PHASE] == CHOOSING and given is None)
+    state.stamps[T_FIRST_VELOCITY] = state.stamps[T] if told else NEVER
     state.stamps[[T_START, T_CONSTRAINT, T_POSITION]] = state.stamps[T]
     state.stamps[T_GNSS_ERROR] = state.stamps[T_FIX]
 

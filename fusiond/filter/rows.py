@@ -12,9 +12,10 @@ from fusiond.filter.observations.model import VALUES
 
 
 class Outcome(IntEnum):
-    """The outcome of an event. FUSED: taken into the state, be it as a measurement or to align. REJECTED: stopped by the
-    innovation gate. TOO_OLD: stamped before the horizon. DUPLICATE: a second event of a source at one instant. INVALID:
-    declared unusable by its protocol, not finite, or out of bounds. WAITING: stamped after the newest IMU sample."""
+    """The outcome of an event. FUSED: taken into the state. REJECTED: stopped by the innovation gate. TOO_OLD: stamped
+    before the horizon. DUPLICATE: a second event of a source at one instant. INVALID: declared unusable by its protocol,
+    not finite, or out of bounds. WAITING: stamped after the newest IMU sample. GATHERED: taken to align, or into
+    hypotheses of the heading, when there was no state yet."""
 
     FUSED = 0
     REJECTED = 1
@@ -22,6 +23,7 @@ class Outcome(IntEnum):
     DUPLICATE = 3
     INVALID = 4
     WAITING = 5
+    GATHERED = 6
 
 
 ROW = np.dtype(

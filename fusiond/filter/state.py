@@ -123,7 +123,7 @@ T_CONSTRAINT = _stamps.one()  # ns, of the last round of motion constraints
 T_STILL = _stamps.one()  # ns, since when the vehicle stands; NEVER if it does not
 T_POSITION = _stamps.one()  # ns, of the last position fused
 T_GNSS_ERROR = _stamps.one()  # ns, instant of GNSS_ERROR_E; NEVER where it is to be drawn anew
-T_FIRST_VELOCITY = _stamps.one()  # ns, begin of the alignment window
+T_FIRST_VELOCITY = _stamps.one()  # ns, begin of the alignment window; from the start on NEVER if the heading is only given
 T_FIX = _stamps.one()  # ns, of FIX_E
 T_REST = _stamps.one()  # ns, end of the standstill that REST_RATE_B is the mean of
 T_START = _stamps.one()  # ns, when the filter began to run
@@ -162,7 +162,7 @@ class ResetReason(IntEnum):
     HEADING_LOST = 2  # too long without the inertial sensor: it aligns again
     NOT_FINITE = 3  # a number was no longer finite: it aligns again
     SOURCE_RETURNED = 4  # a receiver contradicted the state, and the state was likelier to be wrong
-    HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored one
+    HEADING_DECIDED = 5  # the drive decided on the heading, which had been a stored or a given one
     INERTIAL_LIED = 6  # the inertial sensor lied for a while, by all other sources: its part was taken back
     TIME_STEPPED_BACK = 7  # receipt stamps stepped back, a new session: it aligns again
 

@@ -5,8 +5,8 @@ an interval is split exactly at a measurement's instant, so a measurement needs 
 missing, or the two lie further apart than `imu_gap`, the state coasts.
 
 `step` takes nearly every event, and runs compiled. What begins or ends a drive is `step_rarely`'s: the first event, a hole
-in the data, a start from what was gathered, an IMU that is back after so long that the heading may be lost. It needs the
-stored state of an earlier run, and runs in the interpreter.
+in the data, a start from what was gathered, the first proof of a given heading, an IMU that is back after so long that the
+heading may be lost. It needs the stored state of an earlier run, and runs in the interpreter.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 
 from fusiond.filter import gnss_error, heading_bank, inertial_sample, initial_alignment, source_health
+from fusiond.filter.hot_start import has_state
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, roll, watch
-from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, WHEEL_SPEED
+from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, GNSS_YAW, IMU, WHEEL_SPEED, gnss_velocity
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rivals import RIVALS, close_all, mix
 from fusiond.filter.rows import Outcome, Row, Rows
@@ -40,6 +41,7 @@ from fusiond.filter.state import (
     RATE_VARIANCE,
     RESETS,
     RUNNING,
+    T_FIRST_VELOCITY,
     T_FUSED,
     T_IMU,
     T_LAST,
@@ -86,6 +88,7 @@ def step(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> N
             if coasted and not lost:
                 roll(state, params)
         guard(state)
+    _name_gathered(state, row, params)
     state.source_stamps[source, T_LAST] = t_ns
 
 
@@ -98,6 +101,11 @@ def can_step(state: FilterState, row: Row, params: Parameters) -> bool:
         return False
     if phase == ALIGNING:
         return model not in (GNSS_POSITION, GNSS_VELOCITY)
+    if phase == RUNNING and stamps[T_FIRST_VELOCITY] == NEVER:
+        values = row["values"]
+        tells = model == GNSS_VELOCITY and initial_alignment.tells_course(values, values[gnss_velocity.VARIANCE], params)
+        if tells or model == GNSS_YAW:
+            return False
     if phase == RUNNING and model == IMU and coasts(state, t_ns, params):
         if not inertial_sample.is_believed(state, row["values"], t_ns, params):
             return True
@@ -120,6 +128,8 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
     row["outcome"] = Outcome.FUSED
     if stamps[PHASE] == ALIGNING:
         initial_alignment.gather(state, row, params)
+    elif params.models[source] != IMU:
+        _prove_heading(state, row, imu, params)
     else:  # the IMU is back
         advance_all(state, t_ns, imu, params)
         if yaw_variance(state) > square(LOST_HEADING) and _heard_gnss(state, params):
@@ -130,7 +140,24 @@ def step_rarely(state: FilterState, row: Row, imu: Row | None, params: Parameter
             keep_sample(state, row, params)
             constrain(state, params)
         guard(state)
+    _name_gathered(state, row, params)
     state.source_stamps[source, T_LAST] = t_ns
+
+
+def _prove_heading(state: FilterState, row: Row, imu: Row | None, params: Parameters) -> None:
+    """Take a measurement that may confirm a heading that was only given. One that contradicts it drops it, and the filter
+    aligns anew."""
+    step(state, row, imu, params)
+    if params.models[int(row["source"])] == GNSS_YAW:
+        agrees = row["outcome"] == Outcome.FUSED
+        if agrees:
+            state.stamps[T_FIRST_VELOCITY] = state.stamps[T]
+    else:
+        agrees = initial_alignment.prove(state, row["values"], params)
+    if not agrees:
+        count_reset(state, ResetReason.HEADING_DECIDED)
+        initial_alignment.begin(state)
+        initial_alignment.gather(state, row, params)
 
 
 def begin_session(state: FilterState) -> None:
@@ -152,6 +179,13 @@ def _forget_judgement(row: Row) -> None:
     row["ratio"] = 0.0
     row["innovation"][:] = 0.0
     row["variance"][:] = 0.0
+
+
+@compiled
+def _name_gathered(state: FilterState, row: Row, params: Parameters) -> None:
+    """What was taken in is not fused where there is no state that it went into."""
+    if row["outcome"] == Outcome.FUSED and not has_state(state, params):
+        row["outcome"] = Outcome.GATHERED
 
 
 @compiled

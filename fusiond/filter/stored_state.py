@@ -31,10 +31,13 @@ from fusiond.filter.state import (
 from fusiond.maths.rotation import euler, matrix, product
 from fusiond.maths.wgs84 import geodetic, mat_ne
 
-VERSION = 2
+VERSION = 3
 Variance = Annotated[float, Meta(ge=0, le=1e12)]
 Angle = Annotated[float, Meta(ge=-4, le=4)]  # rad
 Bias = Annotated[float, Meta(ge=-100, le=100)]  # rad/s, m/s^2
+Origin = tuple[
+    Annotated[float, Meta(ge=-90, le=90)], Annotated[float, Meta(ge=-360, le=360)], Annotated[float, Meta(ge=-1e6, le=1e6)]
+]  # deg, deg, m
 ThreeBiases = tuple[Bias, Bias, Bias]
 ThreeVariances = tuple[Variance, Variance, Variance]
 
@@ -69,6 +72,8 @@ class StoredState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     accel_bias_variance: ThreeVariances
     calibrations: list[Annotated[float, Meta(ge=-1e6, le=1e6)]]  # values of the error states from CALIBRATIONS on
     calibration_variances: list[Variance]
+    origin: Origin | None = None  # not the filter's, kept with it: that of the local frame sent to an autopilot [deg, deg, m]
+    reset_counter: Annotated[int, Meta(ge=0, le=255)] | None = None  # and the newest number of jumps that it was told of
     checksum: int = 0  # CRC-32 of all the rest
 
 
@@ -111,6 +116,12 @@ def stored_state(state: FilterState, config: Config) -> StoredState:
         calibration_variances=kept.tolist(),
     )
     return msgspec.structs.replace(found, checksum=_checksum(found))
+
+
+def with_frame(stored: StoredState, origin: Origin | None, reset_counter: int | None) -> StoredState:
+    """The same with the local frame of an autopilot."""
+    framed = msgspec.structs.replace(stored, origin=origin, reset_counter=reset_counter)
+    return msgspec.structs.replace(framed, checksum=_checksum(framed))
 
 
 def to_text(stored: StoredState) -> bytes:

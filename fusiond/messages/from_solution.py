@@ -46,6 +46,7 @@ def _message(kind: type[AnyState], estimate: Solution, vehicle: str, outcomes: O
         age_ms=None if estimate.age_ns is None else estimate.age_ns / MILLISECOND,
         resets=estimate.resets,
         fault=fault,
+        heading_confirmed=estimate.heading_confirmed,
         state=state,
         outcomes=outcomes,
     )

@@ -15,6 +15,7 @@ NAMES: dict[Outcome, OutcomeName] = {
     Outcome.DUPLICATE: "duplicate",
     Outcome.INVALID: "invalid",
     Outcome.WAITING: "waiting",
+    Outcome.GATHERED: "gathered",
 }
 
 

@@ -258,7 +258,7 @@ class Changes:
             ResetReason.SOURCE_RETURNED: f"{source}: the state contradicted it and was likelier to be wrong; set to it",
             ResetReason.INERTIAL_LIED: "the inertial sensor contradicted all others; its part was taken back",
             ResetReason.TIME_STEPPED_BACK: "receipt stamps stepped back, a new session; aligning again",
-            ResetReason.HEADING_DECIDED: "the drive contradicted or confirmed the stored heading; the heading is decided",
+            ResetReason.HEADING_DECIDED: "the drive decided on the stored or given heading",
         }[ResetReason(int(stamps[RESET_REASON]))]
 
 

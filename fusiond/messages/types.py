@@ -37,6 +37,7 @@ class OutcomeCounts(Message, frozen=True, kw_only=True):
     duplicate: Annotated[int, _about("received before")] = 0
     invalid: Annotated[int, _about("declared or found unusable")] = 0
     waiting: Annotated[int, _about("newer than the newest IMU sample, held until the IMU catches up")] = 0
+    gathered: Annotated[int, _about("taken to align, when there was no state yet")] = 0
 
 
 class State(Message, frozen=True, kw_only=True):
@@ -86,6 +87,9 @@ class StateAtInstant(Message, frozen=True, kw_only=True):
     ]
     resets: Annotated[int, _about("number of resets, that is jumps of the state")]
     fault: Annotated[str | None, _about("why the state was withheld; null otherwise")] = None
+    heading_confirmed: Annotated[
+        bool, _about("whether the drive or two antennas have confirmed the heading; before, it is given or stored")
+    ] = True
     state: Annotated[State | None, _about("the state; null while there is none")]
     outcomes: Annotated[OutcomeCounts, _about("outcomes of the measurements so far")]
 
@@ -98,7 +102,7 @@ class SettledMessage(StateAtInstant, frozen=True, kw_only=True):
     """The state at the horizon, which no late measurement can change any more, on fusiond/<vehicle>/settled."""
 
 
-OutcomeName = Literal["fused", "rejected", "too_old", "duplicate", "invalid", "waiting"]
+OutcomeName = Literal["fused", "rejected", "too_old", "duplicate", "invalid", "waiting", "gathered"]
 SourceStatus = Literal["nominal", "noisy", "biased", "frozen", "absent"]
 EventKind = Literal["mode", "reset", "source_lost", "source_found", "source_status", "clock"]
 Severity = Literal["info", "notice", "warning", "critical"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from threading import Condition, Event
 from typing import Any, Protocol
 
@@ -117,11 +117,21 @@ class LiveOutput(Protocol):
         """Notes for the health, such as whether the autopilot uses the state."""
 
 
+@dataclass(slots=True)
+class KeptFrame:
+    """What is kept from run to run of the local frame that positions are sent in. Its output replaces the values, and any
+    thread may read them."""
+
+    origin: tuple[float, float, float] | None = None  # latitude, longitude [deg], height [m]; none: not chosen yet
+    reset_counter: int | None = None  # the newest; none: there was none yet
+
+
 @dataclass(frozen=True)
 class OutputContext:
     """What an output can use in addition to the configuration."""
 
     clock: Clock  # the time line of all stamps
     inputs: Mapping[str, LiveInput[Any]]  # by section and name, such as mavlink.fc: to send over a link that is already open
+    frame: KeptFrame = field(default_factory=KeptFrame)  # of the last run, and for the next
 
 

@@ -2,7 +2,8 @@
 
 The stand-ins drop and refuse what ArduPilot and PX4 do, and turn what they accept into latitude, longitude and velocity
 over ground by the autopilots' own equations. References: ArduPilot's GCS_Common.cpp (handle_odometry,
-handle_common_vision_position_estimate_data), AP_VisualOdom_MAV.cpp, AP_GPS_MAV.cpp and Location.cpp (offset_latlng); PX4's
+handle_common_vision_position_estimate_data, send_gps_global_origin), AP_VisualOdom_MAV.cpp (handle_pose_estimate),
+AP_NavEKF3_Measurements.cpp (writeExtNavData), AP_GPS_MAV.cpp and Location.cpp (offset_latlng); PX4's
 mavlink_receiver.cpp (handle_message_odometry, handle_message_vision_position_estimate) and geo.cpp (reproject).
 """
 
@@ -269,25 +270,46 @@ class Accepted(NamedTuple):
     height_m: float
     velocity_n: Triple | None
     quaternion: tuple[float, ...] | None
-    variances: tuple[float, ...]  # as the estimator uses them
+    errors: tuple[float, ...]  # as the estimator uses them: ArduPilot sigmas of position and yaw, PX4 variances
     reset_counter: int | None
     quality: int
 
 
 class ArduPilot:
-    """With the EKF's origin given by the test. `dropped` counts what it drops silently."""
+    """ArduPilot with VISO_TYPE 1 and its other parameters as they come, and the EKF's origin given by the test; `dropped`
+    counts what it drops silently. `position` is where it takes itself to be, `told` how often another reset_counter told it
+    of a jump."""
 
     M_PER_E7 = 0.011131884502145034  # LOCATION_SCALING_FACTOR
+    INTERVAL_MS = 20  # extNavIntervalMin_ms
+    POSITION_NOISE, MAX_POSITION_NOISE = 0.2, 100.0  # m, VISO_POS_M_NSE
+    YAW_NOISE, MAX_YAW_NOISE = 0.2, 1.5  # rad, VISO_YAW_M_NSE
+    LEAST_YAW_ERROR = math.radians(5.0)  # EKF3's own
 
-    def __init__(self, origin: Triple, quality_minimum: int = 1) -> None:
+    def __init__(self, origin: Triple, quality_minimum: int = 0) -> None:
         self._origin, self._quality_minimum = origin, quality_minimum
-        self.dropped = 0
+        self.dropped = self.told = 0
+        self.position: Triple | None = None  # latitude, longitude [deg], height [m]
+        self._last_ms: int | None = None
+        self._reset_counter: int | None = None
 
     def accept(self, m: Any) -> Accepted | None:
         accepted = getattr(self, f"_{m.get_type().lower()}")(m)
         self.dropped += accepted is None
         assert accepted is None or isinstance(accepted, Accepted)
+        if accepted is not None:
+            self.position = accepted.latitude_deg, accepted.longitude_deg, accepted.height_m
+            self.told += self._reset_counter not in (None, accepted.reset_counter)
+            self._reset_counter = accepted.reset_counter
         return accepted
+
+    def answer(self, m: Any) -> Any:
+        """The GPS_GLOBAL_ORIGIN that a command asks for; None for another message."""
+        if m.get_type() != "COMMAND_LONG" or m.command != 512 or m.param1 != 49:
+            return None
+        latitude, longitude, height = self._origin
+        altitude_mm = round(height * 1e2) * 10
+        return dialect.MAVLink_gps_global_origin_message(round(latitude * 1e7), round(longitude * 1e7), altitude_mm)
 
     def _odometry(self, m: Any) -> Accepted | None:
         if m.frame_id != 20 or m.child_frame_id != 12:  # MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD
@@ -297,15 +319,23 @@ class ArduPilot:
         velocity = rotated(m.q, (m.vx, m.vy, m.vz))
         return self._pose(m.time_usec, m, tuple(m.q), m.pose_covariance, (velocity, m.reset_counter, m.quality))
 
-    def _vision_position_estimate(self, m: Any) -> Accepted:
+    def _vision_position_estimate(self, m: Any) -> Accepted | None:
         q = quaternion(matrix_from_euler(m.roll, m.pitch, m.yaw)).tolist()
         return self._pose(m.usec, m, tuple(q), m.covariance, (None, m.reset_counter, 0))
 
-    def _pose(self, time_us: int, m: Any, q: tuple[float, ...], covariance: list[float], rest: Any) -> Accepted:
-        errors = ()
-        if not math.isnan(covariance[0]):
-            position = covariance[0] + covariance[6] + covariance[11]
-            errors = position, covariance[15] + covariance[18] + covariance[20]
+    def _pose(self, time_us: int, m: Any, q: tuple[float, ...], covariance: list[float], rest: Any) -> Accepted | None:
+        time_ms = time_us // 1000
+        if self._last_ms is not None and time_ms - self._last_ms < self.INTERVAL_MS:
+            return None
+        self._last_ms = time_ms
+        position = yaw = 0.0
+        if not math.isnan(covariance[0]):  # not sigmas, nor variances: this is what it does
+            position = math.cbrt(sum(covariance[i] ** 2 for i in (0, 6, 11)))
+            yaw = math.cbrt(sum(covariance[i] ** 2 for i in (15, 18, 20)))
+        errors = (
+            min(max(position, self.POSITION_NOISE), self.MAX_POSITION_NOISE),
+            max(min(max(yaw, self.YAW_NOISE), self.MAX_YAW_NOISE), self.LEAST_YAW_ERROR),
+        )
         latitude, longitude, height = self._origin
         lat = latitude + m.x / self.M_PER_E7 / 1e7
         scale = max(math.cos(math.radians((lat + latitude) / 2)), 0.01)

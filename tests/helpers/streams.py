@@ -23,6 +23,7 @@ from fusiond.filter.state import (
     RESET_SOURCE,
     RESETS,
     RUNNING,
+    T_FIRST_VELOCITY,
     T_POSITION,
     VELOCITY_E,
     FilterState,
@@ -207,7 +208,7 @@ def running_state(
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)
     state.auxiliary[[2, 8]] -= 9.8
     state.stamps[PHASE] = RUNNING
-    state.stamps[T] = state.stamps[T_POSITION] = T0
+    state.stamps[T] = state.stamps[T_POSITION] = state.stamps[T_FIRST_VELOCITY] = T0
     return state
 
 

@@ -30,7 +30,7 @@ from fusiond.messages import EventMessage, HealthMessage, LatencyHealth, Message
 from fusiond.messages.info import config_message, info_message
 from fusiond.messages.schedule import IoHealth
 from fusiond.ports.inputs import InputContext, LiveInput
-from fusiond.ports.outputs import LiveOutput, OutputContext
+from fusiond.ports.outputs import KeptFrame, LiveOutput, OutputContext
 from fusiond_adapters.host import journal
 from fusiond_adapters.host.clock import HostClock
 from fusiond_adapters.host.systemd import Notifier, watchdog_s
@@ -75,7 +75,8 @@ class Daemon:
         )
         self._wake = Event()  # wakes the estimator
         self.inputs = Inputs(self._make_inputs(config), self._max_pause_s, self.stop)
-        made = make_outputs(config, OutputContext(self.clock, self.inputs)) | {one.name: one for one in outputs}
+        frame = self._state_file.frame if self._state_file else KeptFrame()
+        made = make_outputs(config, OutputContext(self.clock, self.inputs, frame)) | {one.name: one for one in outputs}
         if not zenoh:
             del made["zenoh"]
         self.outputs = Outputs(made.values(), self.clock.now_ns, self._introduction, self._max_pause_s)
@@ -190,8 +191,11 @@ class Daemon:
     # --- The stored state
 
     async def _keep_state(self, file: StateFile, executor: ThreadPoolExecutor) -> None:
-        """Store the newest state periodically and at the end, in a thread: a disk may be slow."""
+        """Store the newest state periodically and at the end, in a thread: a disk may be slow. The last run's is stored
+        again at once, with the reset_counter of this run: the next one begins with another even if this one dies early."""
         over = False
+        if file.stored is not None and file.stored.reset_counter != file.frame.reset_counter:
+            await asyncio.get_running_loop().run_in_executor(executor, file.write, file.stored)
         while not over:
             await _first(self._over, self.config.state.every_s)
             over = self._over.is_set()

@@ -52,6 +52,7 @@ class SourceReport(Struct, frozen=True, kw_only=True):
     duplicate: int
     invalid: int
     waiting: int
+    gathered: int
     withheld: int
     invalid_reasons: dict[str, int]
     latency_ms: Latency | None  # None if no event was usable
@@ -267,7 +268,7 @@ def _lines(summary: Summary) -> Iterator[str]:
 
 def _source_table(sources: Mapping[str, SourceReport]) -> Iterator[str]:
     """One line per source; columns of zeros are left out, except the first three."""
-    names = ["events", "fused", "rejected", "too_old", "duplicate", "invalid", "waiting", "withheld"]
+    names = ["events", "fused", "rejected", "too_old", "duplicate", "invalid", "waiting", "gathered", "withheld"]
     shown = [n for n in names if n in names[:3] or any(getattr(source, n) for source in sources.values())]
     lines = [["source", *(name.replace("_", " ") for name in shown), "late by [ms]: median", "99 %", "max"]]
     for name, source in sources.items():

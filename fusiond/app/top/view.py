@@ -38,7 +38,7 @@ MODES: dict[Mode, Colour] = {
 SEVERITIES: dict[Severity, Colour] = {"info": "plain", "notice": "plain", "warning": "yellow", "critical": "red"}
 OUTCOMES = {  # column headings by field
     "fused": "fused", "rejected": "rejected", "too_old": "too old", "duplicate": "dupl", "invalid": "invalid",
-    "waiting": "waiting",
+    "waiting": "waiting", "gathered": "gathered",
 }  # fmt: skip
 BAD_OUTCOMES = frozenset({"rejected", "too_old", "invalid"})
 PARTS = ("all", "state", "sources", "in/out", "events")  # what can be shown, by the keys 1, 2, ...

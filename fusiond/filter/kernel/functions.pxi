@@ -830,6 +830,16 @@ cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noe
     for source in range(state.sources):
         state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 4] = (<int64_t>-4611686018427387904)
 
+# ---------------- fusiond.filter.hot_start
+
+cdef bint hot_start_leads(State* state, Parameters* params) noexcept nogil:
+    if ((state.stamps[10] != 3) or (state.stamps[21] != 1)):
+        return False
+    return (state.bank[(12) * BLOCK + 0] >= 0.5)
+
+cdef bint hot_start_has_state(State* state, Parameters* params) noexcept nogil:
+    return ((state.stamps[10] == 2) or hot_start_leads(state, params))
+
 # ---------------- fusiond.filter.inertial_sample
 
 cdef (double, double, double, double) inertial_sample_compare(State* state, double* values, double elapsed, Parameters* params) noexcept nogil:
@@ -1135,6 +1145,12 @@ cdef void initial_alignment_gather_motion(State* state, Row* row, Parameters* pa
         for _i in range(3):
             (a + 21)[_i] = (a + 15)[_i]
         stamps[8] = t_ns
+
+cdef bint initial_alignment_tells_course(double* velocity_n, double variance, Parameters* params) noexcept nogil:
+    cdef double north
+    cdef double east
+    north, east = velocity_n[0], velocity_n[1]
+    return (variance <= (((north * north) + (east * east)) * (params.heading_variance - (0.03490658503988659 * 0.03490658503988659))))
 
 cdef double initial_alignment__gnss_speed(State* state) noexcept nogil:
     cdef int64_t first
@@ -3245,6 +3261,7 @@ cdef void step_step(State* state, Row* row, Row* imu, Parameters* params) noexce
             if (coasted and (not lost)):
                 motion_constraints_roll(state, params)
         step_guard(state)
+    step__name_gathered(state, row, params)
     state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
 
 cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nogil:
@@ -3252,6 +3269,8 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
     cdef int64_t phase
     cdef int64_t t_ns
     cdef int64_t model
+    cdef double* values
+    cdef bint tells
     cdef double grown
     stamps = state.stamps
     phase = (<int64_t>(state.stamps[10]))
@@ -3260,6 +3279,11 @@ cdef bint step_can_step(State* state, Row* row, Parameters* params) noexcept nog
         return False
     if (phase == 1):
         return (model != 0 and model != 1)
+    if ((phase == 2) and (stamps[6] == (<int64_t>-4611686018427387904))):
+        values = row.values
+        tells = ((model == 1) and initial_alignment_tells_course(values, values[3], params))
+        if (tells or (model == 4)):
+            return False
     if ((phase == 2) and (model == -1) and step_coasts(state, t_ns, params)):
         if (not inertial_sample_is_believed(state, row.values, t_ns, params)):
             return True
@@ -3274,6 +3298,10 @@ cdef void step__forget_judgement(Row* row) noexcept nogil:
         row.innovation[_i] = 0.0
     for _i in range(3):
         row.variance[_i] = 0.0
+
+cdef void step__name_gathered(State* state, Row* row, Parameters* params) noexcept nogil:
+    if ((row.outcome == 0) and (not hot_start_has_state(state, params))):
+        row.outcome = 6
 
 cdef bint step__fuse_while_lost(State* state, Row* row, Parameters* params, double variance) noexcept nogil:
     cdef bint fused

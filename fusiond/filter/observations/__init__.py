@@ -41,6 +41,7 @@ MODELS = (
 IMU = -1  # stands for the inertial sensor where others have their place in MODELS
 MODEL = {model.name: number for number, model in enumerate(MODELS)}
 GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED = MODEL["gnss_position"], MODEL["gnss_velocity"], MODEL["wheel_speed"]
+GNSS_YAW = MODEL["gnss_yaw"]
 CONSTRAINTS = (non_holonomic, zero_velocity, zero_rotation)  # observed by the filter itself: rows of Parameters.constraints
 
 

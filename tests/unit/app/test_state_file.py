@@ -24,12 +24,12 @@ from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.filter.hot_start import Verdict
 from fusiond.filter.state import T
-from fusiond.filter.stored_state import StoredState, from_text, stored_state, to_text
+from fusiond.filter.stored_state import StoredState, from_text, stored_state, to_text, with_frame
 from fusiond.messages.codec import encode
 from fusiond.messages.types import StateMessage
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers import streams
-from tests.helpers.live import Autopilot, Running, configuration, drive, running
+from tests.helpers.live import Autopilot, Running, aligned, configuration, drive, running
 from tests.helpers.network import free_port, udp
 from tests.helpers.streams import running_state
 
@@ -130,15 +130,16 @@ def test_a_torn_file_is_a_cold_start(tmp_path: Path, bus: can.BusABC, caplog: py
     file.write_bytes(torn)
     settings(tmp_path, port, bus)
     with caplog.at_level(logging.WARNING, "fusiond"), running(without_heading(tmp_path)) as run:
-        stand(run, port, bus, lambda: run.daemon.health is not None and fused(run) > 100)
+        stand(run, port, bus, lambda: run.daemon.health is not None and gathered(run) > 100)
         assert last(run) is Mode.ALIGNING
         assert "ignored: torn or altered" in note(run)
+        assert run.daemon.live.engine.fusion.totals()["FUSED"] == 0  # there was no state to go into
     assert sum("stored state ignored" in record.message for record in caplog.records) == 1
     assert (tmp_path / "state.json.damaged").read_bytes() == torn  # to be looked into; a later state does not replace it
 
 
-def fused(run: Running) -> int:
-    return run.daemon.live.engine.fusion.totals()["FUSED"]
+def gathered(run: Running) -> int:
+    return run.daemon.live.engine.fusion.totals()["GATHERED"]
 
 
 def test_a_full_disk_is_counted_and_stops_nothing(
@@ -248,3 +249,29 @@ def test_a_folder_in_its_place_is_reported(tmp_path: Path) -> None:
     assert file.health(Verdict.NONE).notes["hot_start"] == "ignored: cannot be read: Is a directory"
     file.write(left(NOW, streams.config()))
     assert file.lost == 1
+
+
+# --- The local frame of an autopilot
+
+TO_AUTOPILOT = '[autopilot]\nlink = "fc"\nunconfirmed_heading = true\n'
+
+
+def test_the_local_frame_goes_on_in_the_next_run(tmp_path: Path, bus: can.BusABC) -> None:
+    """Also after a run that died before it had a state; and where the sensors are configured otherwise, so that the state
+    itself is of no use."""
+    file, port = tmp_path / "state.json", free_port()
+    with running(settings(tmp_path, port, bus, TO_AUTOPILOT)) as run:
+        stand(run, port, bus, lambda: file.exists() and from_text(file.read_bytes()).origin is not None)
+    first = from_text(file.read_bytes())
+    assert first.origin == pytest.approx((48.1374300, 11.5754900, 563.0), abs=1e-3)
+    assert first.reset_counter is not None
+    with running(settings(tmp_path, port, bus, TO_AUTOPILOT)) as run:
+        run.until(lambda: from_text(file.read_bytes()).reset_counter != first.reset_counter)
+        assert not aligned(run)
+    second = from_text(file.read_bytes())
+    assert second == with_frame(first, first.origin, (first.reset_counter + 128) % 256)
+    toml = tmp_path / "live.toml"
+    toml.write_text(toml.read_text().replace('stamp = "arrival"', 'stamp = "arrival"\nlever_arm_m = [1.0, 0.0, 0.0]'))
+    unusable = StateFile(file, config.load(toml), second.t_ns + DAY)
+    assert unusable.stored is None
+    assert (unusable.frame.origin, unusable.frame.reset_counter) == (first.origin, second.reset_counter)

@@ -29,7 +29,7 @@ from fusiond.filter.state import (
     ResetReason,
     T,
 )
-from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, installation, to_text
+from fusiond.filter.stored_state import StoredState, StoredStateError, check, from_text, installation, to_text, with_frame
 from fusiond.maths.wgs84 import ecef, geodetic, mat_ne
 from tests.conftest import needs_compiled
 from tests.helpers.streams import PULLS_AWAY_S, SECOND, T0, Drive, bits, config, drive, fuse, measurements, ramp
@@ -224,13 +224,46 @@ def test_in_motion_now_it_is_one_hypothesis_of_many() -> None:
     assert first_weight(events, stored()) == (pytest.approx(DOUBTED_WEIGHT), Verdict.DOUBTED)
 
 
-def test_a_given_heading_goes_first() -> None:
-    _, events = later()
-    fusion = Fusion(config(filter={"heading_deg": 100.0}), None, stored())
+def test_a_stored_heading_goes_before_a_given_one_that_contradicts_it() -> None:
+    """It was stored later than the other was configured."""
+    truth, events = later()
+    for given_deg, verdict in ((100.0, Verdict.USED), (math.degrees(stored().yaw) + 1.0, Verdict.OTHERWISE_KNOWN)):
+        fusion = Fusion(config(filter={"heading_deg": given_deg}), None, stored())
+        for event in events:
+            fusion.fuse(event)
+        assert fusion.hot_start() is verdict
+        error, sigma = off(fusion, truth)
+        assert abs(error) < 3 * sigma
+        solution = fusion.solution_at(int(fusion.history.head.stamps[T]))
+        assert solution.mode is Mode.NOMINAL and not solution.heading_confirmed  # it has not driven
+        running = fusion.history.head if verdict is Verdict.OTHERWISE_KNOWN else fusion.history.head.hypothesis(STORED)
+        assert running.nominal[WHEEL_SCALE] == pytest.approx(stored().calibrations[0], abs=1e-3)
+
+
+@needs_compiled
+@pytest.mark.parametrize("speed", [3.0, 12.0])
+@pytest.mark.parametrize("age_s", [2, 30])
+def test_restarted_in_motion_a_wrong_given_heading_does_no_harm(speed: float, age_s: int) -> None:
+    """Be what is stored seconds old, or too old to be of use: no heading is told that is far off."""
+    moving = msgspec.structs.replace(stored(), at_rest=False)
+    yaw = stored().yaw
+    truth = drive(
+        12.0, lambda t: speed + 0.8 * np.sin(t), lambda t: yaw + 0.3 * np.sin(0.5 * t), rate=50.0, start=place()
+    )
+    events = shifted(measurements(truth, seed=4), stored().t_ns + age_s * SECOND - T0)
+    fusion = Fusion(config(filter={"heading_deg": math.degrees(yaw) - 144.0}), True, moving)
+    seen = 0
     for event in events:
         fusion.fuse(event)
-    assert fusion.hot_start() is Verdict.OTHERWISE_KNOWN
-    assert fusion.history.head.nominal[WHEEL_SCALE] == pytest.approx(stored().calibrations[0], abs=1e-3)
+        solution = fusion.solution_at(event.t_ns)
+        if event.source == "gps0.velocity" and solution.state is not None:
+            at = min(truth.at((event.t_ns - events[0].t_ns) / SECOND), len(truth.seconds) - 1)
+            forward_n = mat_ne(truth.position_e[at]) @ truth.mat_eb[at][:, 0]
+            error = solution.state.euler()[2] - math.atan2(forward_n[1], forward_n[0])
+            assert abs((error + math.pi) % (2 * math.pi) - math.pi) < math.radians(10.0)
+            assert solution.heading_confirmed
+            seen += 1
+    assert seen > 20
 
 
 @pytest.mark.parametrize(("age_ns", "verdict"), [(-HOUR, Verdict.FUTURE), (8 * 24 * HOUR, Verdict.STALE)])
@@ -294,7 +327,7 @@ def test_a_gyro_that_has_changed_contradicts_what_is_stored() -> None:
 def test_a_later_start_is_not_hot() -> None:
     """After a hole in the data the filter knows more than what was stored, and than the heading that was given."""
     _, events = later(seconds=3.0)
-    given = config(filter={"heading_deg": 0.0})
+    given = config(filter={"heading_deg": math.degrees(stored().yaw)})
     fusion = Fusion(given, None, stored())
     for event in events:
         fusion.fuse(event)
@@ -334,6 +367,10 @@ def test_both_kernels_agree() -> None:
 
 def test_text_and_back() -> None:
     assert from_text(to_text(stored())) == stored()
+    framed = with_frame(stored(), (48.1, 11.6, 520.25), 129)
+    assert from_text(to_text(framed)) == framed
+    with pytest.raises(StoredStateError, match="checksum"):
+        from_text(to_text(framed).replace(b"129", b"128"))
 
 
 def test_whatever_is_torn_or_altered_is_found() -> None:
@@ -345,8 +382,8 @@ def test_whatever_is_torn_or_altered_is_found() -> None:
         from_text(text.replace(b'"at_rest": true', b'"at_rest": false'))
     with pytest.raises(StoredStateError, match="torn or altered"):
         from_text(text.replace(b'"roll"', b'"rolled"'))
-    with pytest.raises(StoredStateError, match="its version is 1, not 2"):
-        from_text(text.replace(b'"version": 2', b'"version": 1'))
+    with pytest.raises(StoredStateError, match="its version is 2, not 3"):
+        from_text(text.replace(b'"version": 3', b'"version": 2'))
 
 
 def test_it_is_for_one_vehicle_as_it_is_configured() -> None:

@@ -39,7 +39,7 @@ from fusiond.filter.state import (
 from fusiond.filter.step import LOST_HEADING, yaw_variance
 from fusiond.maths.rotation import euler, matrix, matrix_from_euler, skew
 from tests.conftest import needs_compiled
-from tests.helpers.streams import MS, SECOND, T0, WHEELS, Drive, bits, config, drive, fuse, measurements
+from tests.helpers.streams import MS, PULLS_AWAY_S, SECOND, T0, WHEELS, Drive, bits, config, drive, fuse, measurements, ramp
 
 HEADING = 0.4  # rad
 GIVEN = {"heading_deg": math.degrees(HEADING), "heading_sigma_deg": 2.0}
@@ -102,7 +102,7 @@ def test_at_rest_without_a_heading_it_waits(compiled: bool) -> None:
     assert fusion.history.head.stamps[PHASE] == CHOOSING
     estimate = fusion.solution_at(T0 + 4 * SECOND)
     assert (estimate.mode, estimate.state) == (Mode.ALIGNING, None)
-    assert fusion.totals()["FUSED"] == sum(fusion.totals().values())
+    assert fusion.totals()["GATHERED"] == sum(fusion.totals().values())  # there is no state that anything went into
 
 
 def test_in_motion_by_the_course(compiled: bool) -> None:
@@ -222,6 +222,51 @@ def test_a_heading_that_the_course_contradicts_wins_in_reverse() -> None:
     assert attitude(fusion)[2] == pytest.approx(math.degrees(HEADING + 1.0), abs=2.0)
 
 
+def pulling_away(turned: float, speed: float, seconds: float = 12.0) -> list[Measurement]:
+    """Stands for 3 s, then drives off with a heading so far from the given one."""
+    curve = lambda t: speed * ramp(t, PULLS_AWAY_S, 4.0)  # noqa: E731
+    truth = drive(seconds, curve, lambda t: HEADING + turned + 0.2 * np.sin(0.5 * t) * ramp(t, 3.0, 3.0), rate=50.0)
+    return measurements(truth)
+
+
+def confirmed(fusion: Fusion) -> bool:
+    return fusion.solution_at(int(fusion.history.head.stamps[T])).heading_confirmed
+
+
+def test_a_given_heading_is_confirmed_by_the_drive(compiled: bool) -> None:
+    """Also below the speed of a course; at rest nothing confirms it."""
+    fusion, events = Fusion(config(filter=GIVEN), compiled), pulling_away(0.05, 3.0, 6.0)
+    for event in events:
+        fusion.fuse(event)
+        if event.t_ns == T0 + PULLS_AWAY_S * SECOND:
+            assert fusion.history.head.stamps[PHASE] == RUNNING and not confirmed(fusion)
+    assert confirmed(fusion)
+    assert fusion.history.head.stamps[RESETS] == 0
+
+
+@needs_compiled
+@pytest.mark.parametrize("turned_deg", [60.0, 144.0, 180.0])
+def test_a_given_heading_that_the_drive_contradicts_is_dropped(turned_deg: float) -> None:
+    """It is never called confirmed, and soon after the speed of a course the right one is known."""
+    fusion = Fusion(config(filter=GIVEN), True)
+    for event in pulling_away(math.radians(turned_deg), 14.0, 14.0):
+        fusion.fuse(event)
+        if event.source == "gps0.velocity" and confirmed(fusion):
+            off = attitude(fusion)[2] - math.degrees(HEADING) - turned_deg
+            assert abs((off + 180) % 360 - 180) < 25.0  # it weaves by 11 deg
+    assert confirmed(fusion)
+    head = fusion.history.head
+    assert (head.stamps[RESETS], head.stamps[RESET_REASON]) == (1, ResetReason.HEADING_DECIDED)
+
+
+@needs_compiled
+def test_both_kernels_prove_a_heading_alike() -> None:
+    events = pulling_away(math.radians(144.0), 14.0, 8.0)
+    one, other = (fuse(config(filter=GIVEN), events, compiled).history.head for compiled in (True, False))
+    np.testing.assert_array_equal(one.whole, other.whole)
+    np.testing.assert_array_equal(bits(one.numbers), bits(other.numbers))
+
+
 @pytest.mark.parametrize("sigma_deg", [9.0, 15.0, 24.0, 40.0, 1e5])
 def test_hypotheses_of_a_given_heading_make_up_its_distribution(sigma_deg: float) -> None:
     sigma = math.radians(sigma_deg)
@@ -328,7 +373,7 @@ def test_starts_again_after_a_gap(compiled: bool, gap_s: float, resets: int) -> 
         np.testing.assert_allclose(head.nominal[POSITION_E], second.position_e[-1], atol=2.0)
         np.testing.assert_allclose(head.nominal[VELOCITY_E], second.velocity_e[-1], atol=0.3)
         assert attitude(fusion)[2] == pytest.approx(math.degrees(2.0), abs=1.5)
-    assert fusion.totals()["FUSED"] + fusion.totals()["REJECTED"] == len(events)
+    assert sum(fusion.totals()[name] for name in ("FUSED", "REJECTED", "GATHERED")) == len(events)
 
 
 IN_BEND = 6.0  # s, when the autopilot falls silent
@@ -442,7 +487,7 @@ def test_a_state_that_is_not_finite_is_emptied(compiled: bool, place: str, poiso
     with np.errstate(invalid="ignore"):
         for event in rest:
             outcome = fusion.fuse(event).outcome
-            assert outcome in (Outcome.FUSED, Outcome.REJECTED, Outcome.WAITING)
+            assert outcome in (Outcome.FUSED, Outcome.REJECTED, Outcome.WAITING, Outcome.GATHERED)
             if head.stamps[BLOWN]:
                 estimate = fusion.solution_at(event.t_ns).state
                 assert estimate is None or math.isfinite(sum(estimate.velocity_n) + estimate.covariance.sum())

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from fusiond.config.schema import Config
 from fusiond.estimator.solution import Mode
 from fusiond.maths.rotation import euler, matrix
 from fusiond.messages.types import State, StateMessage
+from fusiond.ports.outputs import KeptFrame
 from fusiond_adapters.mavlink.autopilot import AutopilotOutput, Readback
 from fusiond_adapters.mavlink.outgoing import CONVENTIONS, Origin, odometry
 from tests.helpers.live import configuration
@@ -96,17 +98,17 @@ def test_the_autopilot_gets_the_state(peer: Peer, kind: str, message: str, tmp_p
         assert accepted.height_m == pytest.approx(want.height_m, abs=1e-5)
         assert accepted.quaternion is not None
         assert abs(np.dot(accepted.quaternion, want.quaternion_nb)) == pytest.approx(1, abs=1e-6)
-        assert accepted.reset_counter == 259 % 256
+        assert accepted.reset_counter == (output.frame.count(0) + 259) % 256
         if message == "odometry":
             assert accepted.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
             assert 1 <= accepted.quality <= 100
-        check_variances(accepted.variances, want, kind)
+        check_variances(accepted.errors, want, kind)
 
 
 def check_variances(variances: tuple[float, ...], want: State, kind: str) -> None:
     position = diagonal(want.covariance_position_m2)
     if kind == "ardupilot":
-        assert variances[0] == pytest.approx(sum(position), rel=1e-5)
+        assert variances[0] == pytest.approx(max(math.cbrt(sum(square**2 for square in position)), 0.2), rel=1e-5)
         return
     assert variances[:3] == pytest.approx(position, rel=1e-5)
     if len(variances) > 6:
@@ -119,8 +121,8 @@ def test_what_pleases_one_autopilot_is_refused_by_the_other() -> None:
     message = state_at(10**18, 3)
     origin = Origin.of(state_of(message))
     here = position_of(message)
-    to_px4 = odometry(message, state_of(message), origin, CONVENTIONS["px4"], 50)
-    to_ardupilot = odometry(message, state_of(message), origin, CONVENTIONS["ardupilot"], 50)
+    to_px4 = odometry(message, state_of(message), origin, CONVENTIONS["px4"], 50, 0)
+    to_ardupilot = odometry(message, state_of(message), origin, CONVENTIONS["ardupilot"], 50, 0)
     ardupilot, px4 = ArduPilot(here), Px4(here)
     assert ardupilot.accept(to_px4) is None and ardupilot.dropped == 1
     assert px4.accept(to_ardupilot) is None and px4.refused == 1
@@ -128,7 +130,7 @@ def test_what_pleases_one_autopilot_is_refused_by_the_other() -> None:
     assert px4.accept(to_px4) is None
     to_px4.estimator_type = dialect.MAV_ESTIMATOR_TYPE_NAIVE
     naive = px4.accept(to_px4)
-    assert naive is not None and naive.variances == ()
+    assert naive is not None and naive.errors == ()
     to_ardupilot.quality = -1
     assert ardupilot.accept(to_ardupilot) is None
 
@@ -154,7 +156,7 @@ def test_gps_input(udp: UdpPeer, tmp_path: Path) -> None:
         assert accepted.velocity_n == pytest.approx(want.velocity_ned_mps, abs=1e-5)
         yaw = math.degrees(euler(matrix(np.array(accepted.quaternion)))[2])
         assert math.remainder(yaw - want.yaw_deg, 360) == pytest.approx(0, abs=0.01)
-        assert accepted.variances[:2] == pytest.approx(
+        assert accepted.errors[:2] == pytest.approx(
             (max(want.sigma_position_ned_m[:2]), want.sigma_position_ned_m[2]), rel=1e-5
         )
         gps_epoch_to_unix_us = (315_964_800 - 18) * 10**6
@@ -197,8 +199,9 @@ def test_an_unfit_state_is_not_sent_and_that_is_reported_once(
     assert output.notes()["sending"].startswith("no: ") and reason in output.notes()["sending"]
 
 
-def made(tmp_path: Path, more: str) -> tuple[AutopilotOutput, Any]:
+def made(tmp_path: Path, more: str, geoid_m: float = 0.0) -> tuple[AutopilotOutput, Any]:
     settings = configuration(tmp_path, "udpin:127.0.0.1:1", more)
+    settings = msgspec.structs.replace(settings, vehicle=msgspec.structs.replace(settings.vehicle, geoid_m=geoid_m))
     link: Any = Recorder(settings)
     return AutopilotOutput(settings, link, lambda: 10**18), link
 
@@ -210,16 +213,27 @@ def test_dead_reckoning_is_sent_only_if_wanted(tmp_path: Path) -> None:
         assert ("ODOMETRY" in link.kinds()) is wanted
 
 
+def test_a_heading_that_nothing_has_confirmed_is_sent_only_if_wanted(tmp_path: Path) -> None:
+    for wanted in (True, False):
+        output, link = made(tmp_path, f"{ON}unconfirmed_heading = {str(wanted).lower()}\n")
+        output.offer(msgspec.structs.replace(state_at(10**18), heading_confirmed=False))
+        assert ("ODOMETRY" in link.kinds()) is wanted
+        assert ("drive" in output.notes()["sending"]) is not wanted
+        output.offer(state_at(10**18 + 100 * MS))
+        assert "ODOMETRY" in link.kinds()
+
+
 def test_the_origin_is_that_of_the_first_fit_state(tmp_path: Path) -> None:
     output, link = made(tmp_path, ON)
     output.offer(state_at(10**18 - 400 * MS, 0, mode=Mode.LOST))
-    assert output.origin is None
+    assert output.frame.origin is None
     for number in (1, 2, 3):
         output.offer(state_at(10**18 - (4 - number) * 100 * MS, number, resets=number))
     first, *_, last = [m for m in link.sent if m.get_type() == "ODOMETRY"]
     assert (first.x, first.y, first.z) == (0, 0, 0)
-    assert last.z == pytest.approx(-6.5) and last.reset_counter == 3
-    assert output.origin == Origin.of(state_of(state_at(0, 1)))
+    assert last.z == pytest.approx(-6.5) and (last.reset_counter - first.reset_counter) % 256 == 2
+    assert output.frame.origin == Origin.of(state_of(state_at(0, 1)))
+    assert output.notes()["origin"] == "our own: the autopilot reports none"
 
 
 def test_a_state_that_waited_too_long_is_not_sent(tmp_path: Path) -> None:
@@ -254,11 +268,148 @@ def test_the_origin_is_set_until_the_autopilot_names_one(tmp_path: Path) -> None
     set_to = link.sent[1]
     assert set_to.get_type() == "SET_GPS_GLOBAL_ORIGIN" and set_to.target_system == SYSTEM
     assert set_to.latitude == round(state.lat_deg * 1e7) and set_to.altitude == round(state.height_m * 1e3)
-    theirs = dialect.MAVLink_gps_global_origin_message(set_to.latitude + 10_000, set_to.longitude, set_to.altitude, 0)
+    theirs = dialect.MAVLink_gps_global_origin_message(set_to.latitude, set_to.longitude, set_to.altitude, 0)
     output.readback.receive(bytes(theirs.pack(sender)), 0)
     output.offer(state_at(10**18 + 3000 * MS))
     assert link.kinds().count("SET_GPS_GLOBAL_ORIGIN") == 1
-    assert output.notes()["origin"] == "the autopilot's local frame begins 111.3 m from ours"
+    first, second = (m for m in link.sent if m.get_type() == "ODOMETRY")
+    assert first.reset_counter == second.reset_counter  # it has taken ours
+
+
+# --- One local frame, from run to run
+
+
+def driving(metres: float, t_ms: int) -> StateMessage:
+    """A state so far north of the others' start, at an instant after it."""
+    message = state_at(10**18 + t_ms * MS)
+    state = msgspec.structs.replace(state_of(message), lat_deg=state_of(state_at(0)).lat_deg + metres / 111_200)
+    return msgspec.structs.replace(message, state=state)
+
+
+def run(
+    tmp_path: Path, kept: KeptFrame, autopilot: ArduPilot, states: list[StateMessage], *, answers: bool
+) -> AutopilotOutput:
+    """One run of fusiond, to its end: states to an autopilot that may answer what it is asked."""
+    now = [states[0].t_ns]
+    link: Any = Recorder(configuration(tmp_path, "udpin:127.0.0.1:1", ON))
+    link.housekeeping.target = SYSTEM, COMPONENT
+    output = AutopilotOutput(link_settings(tmp_path), link, lambda: now[0], kept)
+    sender = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    for state in states:
+        now[0] = state.t_ns
+        output.ask_for_origin()
+        output.offer(state)
+        for message in link.sent:
+            if message.get_type() == "ODOMETRY":
+                autopilot.accept(message)
+            elif answers and (answer := autopilot.answer(message)):
+                output.readback.receive(bytes(answer.pack(sender)), now[0])
+        link.sent.clear()
+    return output
+
+
+def link_settings(tmp_path: Path) -> Config:
+    return configuration(tmp_path, "udpin:127.0.0.1:1", ON)
+
+
+def off_m(autopilot: ArduPilot, state: StateMessage) -> float:
+    """Distance of the autopilot's position from a state's."""
+    assert autopilot.position is not None
+    want = state_of(state)
+    north, east = (autopilot.position[0] - want.lat_deg) * 111_200, (autopilot.position[1] - want.lon_deg) * 74_000
+    return math.hypot(north, east, autopilot.position[2] - want.height_m)
+
+
+@pytest.mark.parametrize("answers", [True, False], ids=["reports its origin", "silent"])
+@pytest.mark.parametrize("file", [True, False], ids=["state file", "no state file"])
+def test_a_restart_in_motion(tmp_path: Path, answers: bool, file: bool) -> None:
+    """The autopilot flies on while fusiond is killed and comes back 80 m further: its position is right then, or it is told
+    of a jump."""
+    begin = state_of(state_at(0))
+    autopilot = ArduPilot((begin.lat_deg, begin.lon_deg, begin.height_m))
+    kept = KeptFrame()
+    before = [driving(10.0 * k / 25, 40 * k) for k in range(25)]
+    run(tmp_path, kept, autopilot, before, answers=answers)
+    assert off_m(autopilot, before[-1]) < 0.1 and autopilot.told == 0
+    after = [driving(80.0 + 10.0 * k / 25, 8000 + 40 * k) for k in range(25)]
+    output = run(tmp_path, kept if file else KeptFrame(), autopilot, after, answers=answers)
+    assert autopilot.told >= 1
+    if answers or file:
+        assert off_m(autopilot, after[-1]) < 0.1
+    assert output.notes()["origin"].startswith("the autopilot's" if answers else "our own")
+
+
+def test_many_restarts_are_each_told(tmp_path: Path) -> None:
+    """Each run's counter differs from the one before, whatever was counted after the last was kept."""
+    autopilot = ArduPilot(position_of(state_at(0)))
+    kept, lost = KeptFrame(), 5
+    for restart in range(20):
+        stale = KeptFrame(kept.origin, kept.reset_counter)
+        states = [state_at(10**18 + restart * 10**9 + 40 * k * MS, 0, resets=k) for k in range(lost)]
+        run(tmp_path, kept, autopilot, states, answers=True)
+        assert autopilot.told == restart * lost + lost - 1
+        kept = stale if restart % 2 and stale.reset_counter is not None else kept
+
+
+def test_an_origin_that_comes_late_is_a_jump_that_is_told(tmp_path: Path) -> None:
+    """It gets its own after we began with ours: from then on ours is the same."""
+    begin = state_of(state_at(0))
+    autopilot = ArduPilot((begin.lat_deg - 0.001, begin.lon_deg, begin.height_m - 20.0))
+    kept = KeptFrame()
+    output = run(tmp_path, kept, autopilot, [driving(0.0, 0)], answers=False)
+    assert off_m(autopilot, driving(0.0, 0)) > 100.0
+    sender = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    answer = autopilot.answer(dialect.MAVLink_command_long_message(SYSTEM, 1, 512, 0, 49, 0, 0, 0, 0, 0, 0))
+    output.readback.receive(bytes(answer.pack(sender)), 0)
+    for k in range(1, 4):
+        output.offer(driving(0.5 * k, 40 * k))
+        autopilot.accept(output._link.sent[-1])
+        assert off_m(autopilot, driving(0.5 * k, 40 * k)) < 0.1
+    assert autopilot.told == 1
+    assert kept.origin == pytest.approx((begin.lat_deg - 0.001, begin.lon_deg, begin.height_m - 20.0), abs=1e-2)
+
+
+def test_the_height_of_their_origin_is_above_the_sea(tmp_path: Path) -> None:
+    """Ours are above the ellipsoid where the receiver gives that: the geoid's height is what it says, or as configured."""
+    sender = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    fix = dialect.MAVLink_gps_raw_int_message(0, 3, 0, 0, 565_000, 80, 120, 0, 0, 14, 612_500)
+    for geoid_m, undulation in ((0.0, 47.5), (46.0, 46.0)):
+        output, link = made(tmp_path, ON, geoid_m)
+        link.housekeeping.target = SYSTEM, COMPONENT
+        output.readback.receive(bytes(fix.pack(sender)), 0)
+        state = state_of(state_at(0))
+        theirs = dialect.MAVLink_gps_global_origin_message(round(state.lat_deg * 1e7), round(state.lon_deg * 1e7), 550_000)
+        output.readback.receive(bytes(theirs.pack(sender)), 0)
+        output.offer(state_at(10**18))
+        assert link.sent[-1].z == pytest.approx(-(612.5 - undulation - 550.0), abs=1e-3)
+
+
+def test_the_origin_is_asked_for_until_it_comes_and_then_rarely(tmp_path: Path) -> None:
+    now = [0]
+    link: Any = Recorder(link_settings(tmp_path))
+    output = AutopilotOutput(link_settings(tmp_path), link, lambda: now[0])
+    output.ask_for_origin()
+    assert not link.sent  # whom?
+    link.housekeeping.target = SYSTEM, COMPONENT
+    for _ in range(100):
+        output.ask_for_origin()
+        now[0] += 200 * MS
+    assert len(link.sent) == 10 and {(m.command, m.param1, m.target_system) for m in link.sent} == {(512, 49, SYSTEM)}
+    output.readback.origin = Origin(0.0, 0.0, 0.0)
+    for _ in range(100):
+        output.ask_for_origin()
+        now[0] += 200 * MS
+    assert len(link.sent) == 12
+
+
+def test_faster_than_50_hz_ekf3_drops_half() -> None:
+    autopilot = ArduPilot(position_of(state_at(0)))
+    for hz, lost in ((40, 0), (50, 0), (100, 50)):
+        states = [state_at(10**18 + hz * 10**10 + k * 1000 // hz * MS) for k in range(100)]
+        before = autopilot.dropped
+        for state in states:
+            autopilot.accept(odometry(state, state_of(state), Origin.of(state_of(state)), CONVENTIONS["ardupilot"], 50, 0))
+        assert autopilot.dropped - before == lost
 
 
 # --- Does it use us?
@@ -331,7 +482,7 @@ def test_a_stalled_peer_delays_nothing_else_and_tears_no_frame(tmp_path: Path) -
     stalled = TcpPeer(buffer=4096)
     _, link = link_to(stalled, tmp_path, ON)
     endpoint = Endpoint(stalled)
-    message = odometry(state_at(0), state_of(state_at(0)), Origin.of(state_of(state_at(0))), CONVENTIONS["ardupilot"], 50)
+    message = odometry(state_at(0), state_of(state_at(0)), Origin.of(state_of(state_at(0))), CONVENTIONS["ardupilot"], 50, 0)
     with serving(link):
         greeted(endpoint, link)
         slowest, lost, tries = 0.0, 0, 0

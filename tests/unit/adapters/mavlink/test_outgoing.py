@@ -23,7 +23,7 @@ def test_angles_in_the_covariance_are_those_of_roll_pitch_and_yaw() -> None:
         columns.append((np.array(turned) - np.array(euler(mat_nb))) / step)
     jacobian = np.column_stack(columns)
     want = jacobian @ np.array(state.covariance_attitude_rad2).reshape(3, 3) @ jacobian.T
-    covariance = vision_position(message, state, Origin.of(state), CONVENTIONS["px4"]).covariance
+    covariance = vision_position(message, state, Origin.of(state), CONVENTIONS["px4"], 0).covariance
     whole = np.zeros((6, 6))
     whole[np.triu_indices(6)] = covariance
     np.testing.assert_allclose(whole[3:, 3:][np.triu_indices(3)], want[np.triu_indices(3)], rtol=1e-4, atol=1e-9)

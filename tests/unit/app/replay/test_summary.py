@@ -45,13 +45,13 @@ def test_many_stretches_are_counted_but_not_all_kept() -> None:
 
 
 def test_source_report_adds_up() -> None:
-    outcomes = {"FUSED": 5, "REJECTED": 1, "TOO_OLD": 0, "DUPLICATE": 2, "INVALID": 3, "WAITING": 0}
+    outcomes = {"FUSED": 5, "REJECTED": 1, "TOO_OLD": 0, "DUPLICATE": 2, "INVALID": 3, "WAITING": 0, "GATHERED": 0}
     found = report.source_report(4, outcomes, {"no fix": 3}, None)
     assert (found.events, found.fused, found.withheld, found.invalid_reasons) == (15, 5, 4, {"no fix": 3})
 
 
 def summary() -> report.Summary:
-    outcomes = {"FUSED": 5, "REJECTED": 1, "TOO_OLD": 2, "DUPLICATE": 0, "INVALID": 3, "WAITING": 0}
+    outcomes = {"FUSED": 5, "REJECTED": 1, "TOO_OLD": 2, "DUPLICATE": 0, "INVALID": 3, "WAITING": 0, "GATHERED": 0}
     lateness = report.TooOld(late_s=1.3, beyond_s=0.25, clock="unix")
     source = report.source_report(0, outcomes, {"no fix": 3}, None, lateness)
     return report.Summary(

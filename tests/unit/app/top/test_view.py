@@ -66,7 +66,7 @@ def test_state_sources_and_events() -> None:
     assert f"{state.state.lat_deg:.7f} N" in text and f"{state.state.sigma_yaw_deg:.2f}" in text and " 50 Hz" in text
     for source, found in health.sources.items():
         (row,) = [line for line in texts(lines) if line.startswith(f"{source} ")]
-        assert row.split()[3:9] == [str(count) for count in msgspec.structs.astuple(found.outcomes)]
+        assert row.split()[3:10] == [str(count) for count in msgspec.structs.astuple(found.outcomes)]
     assert "mode: nominal -> dead_reckoning" in text and "up        0:00:0" in text
     assert colour_of(lines, "dead reckoning") == colour_of(lines, "-> dead_reckoning") == "yellow"
 
