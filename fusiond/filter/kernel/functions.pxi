@@ -1324,20 +1324,19 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     cdef int64_t* stamps
     cdef int64_t model
     cdef bint gnss
-    cdef double distance
-    cdef int64_t a
     cdef bint wheel
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
     model = params.models[source]
     gnss = (model == 0 or model == 1)
     if (memory[18] != 0):
-        distance = 0.0
-        for a in range(m):
-            distance += (whitened[a] * whitened[a])
-        if rivals_returns(state, source, distance, m, params):
-            memory[18] = 0.0
+        if (model == 1):
+            if source_health_is_due(stamps, t_ns, correlation):
+                source_health_judge(memory, stamps, whitened, m, same, t_ns)
+        elif rivals_fits_again(state, source, whitened, m, params):
             source_health_begin(memory)
+        if (source_health_odds_of_bias(memory) < 0.01):
+            memory[18] = 0.0
         return
     if ((not gnss) and (state.stamps[22] > 0)):
         return
@@ -1469,6 +1468,8 @@ cdef void measurement__suspect_state(State* state, int64_t source, double* value
     cdef State rival
     odds = state.bank[(1) * BLOCK + 0]
     if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[23] != source)):
+        return
+    if (state.memory[(source) * MEMORY_SIZE + 18] != 0):
         return
     wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
     odds *= ((wrong / (1 - wrong)) / 0.001)
@@ -2768,12 +2769,17 @@ cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* para
     rivals_suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
     return (state.bank[(1) * BLOCK + 0] > 0)
 
-cdef bint rivals_returns(State* state, int64_t source, double distance, int64_t m, Parameters* params) noexcept nogil:
-    cdef int64_t position
-    cdef bint alone
-    position = rivals_position_of(source, params)
-    alone = ((source != position) and (state.memory[(position) * MEMORY_SIZE + 18] != 0))
-    return ((distance <= (2 * m)) and (not (alone and (state.memory[(source) * MEMORY_SIZE + 19] > 1.5))))
+cdef bint rivals_fits_again(State* state, int64_t source, double* whitened, int64_t m, Parameters* params) noexcept nogil:
+    cdef int64_t companion
+    cdef double distance
+    cdef int64_t a
+    companion = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 11]))
+    if ((companion >= 0) and (state.memory[(companion) * MEMORY_SIZE + 18] != 0)):
+        return False
+    distance = 0.0
+    for a in range(m):
+        distance += (whitened[a] * whitened[a])
+    return (distance <= (2 * m))
 
 cdef int64_t rivals_position_of(int64_t source, Parameters* params) noexcept nogil:
     cdef int64_t i
@@ -2886,11 +2892,15 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
 cdef void rivals_exclude(State* state, int64_t suspect, double excluded, Parameters* params) noexcept nogil:
     cdef int64_t companion
     companion = (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))
-    state.memory[(suspect) * MEMORY_SIZE + 18] = excluded
-    source_health_begin(state.memory + (suspect) * MEMORY_SIZE)
+    rivals__exclude(state.memory + (suspect) * MEMORY_SIZE, excluded)
     if (companion >= 0):
-        state.memory[(companion) * MEMORY_SIZE + 18] = excluded
-        source_health_begin(state.memory + (companion) * MEMORY_SIZE)
+        rivals__exclude(state.memory + (companion) * MEMORY_SIZE, excluded)
+
+cdef void rivals__exclude(double* memory, double excluded) noexcept nogil:
+    memory[18] = excluded
+    source_health_begin(memory)
+    if (excluded != 0):
+        source_health_distrust(memory)
 
 cdef void rivals_mix(State* state) noexcept nogil:
     cdef double total
