@@ -2,6 +2,7 @@
 
 
 cdef double[4] PRIOR = [0.997, 0.001, 0.001, 0.001]
+cdef double[4] PRIOR_OF_LIAR = [0.499, 0.001, 0.499, 0.001]
 
 # ---------------- fusiond.maths.linear
 
@@ -2986,6 +2987,7 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
     cdef double elapsed
     cdef double blurred
     cdef int64_t i
+    cdef double usual
     if ((((memory[4] + memory[5]) + memory[6]) + memory[7]) == 0):
         source_health_begin(memory)
     elapsed = 20.0
@@ -2994,7 +2996,8 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
     stamps[4] = t_ns
     blurred = (1 - portable_exp(((-elapsed) / 20.0)))
     for i in range(4):
-        memory[(14 + i)] = (memory[(4 + i)] + (blurred * (PRIOR[i] - memory[(4 + i)])))
+        usual = (PRIOR[i] if (memory[18] == 0) else PRIOR_OF_LIAR[i])
+        memory[(14 + i)] = (memory[(4 + i)] + (blurred * (usual - memory[(4 + i)])))
     source_health_look(memory, whitened, m, same)
     source_health__follow_bias(memory, whitened, m)
 
