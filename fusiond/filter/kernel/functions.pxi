@@ -852,9 +852,9 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
         force += portable_square((values[i] - a[(0 + i)]))
         rate += portable_square((values[(3 + i)] - a[(3 + i)]))
     white = (6.0 / (0.0001 if 0.0001 > elapsed else elapsed))
-    _t2 = a[43]
+    _t2 = a[44]
     _t3 = (white * params.noise.accel)
-    _t4 = a[44]
+    _t4 = a[45]
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
@@ -884,7 +884,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         return False
     since = inertial_sample_since_last(state, t_ns, params)
-    if (not (state.auxiliary[45] > since)):
+    if (not (state.auxiliary[46] > since)):
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -921,7 +921,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     t_ns = (<int64_t>row.t_ns)
     since = inertial_sample_since_last(state, t_ns, params)
     if (since == INFINITY):
-        a[45] = 0.0
+        a[46] = 0.0
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -941,18 +941,18 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
             else:
                 row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
                 row.variance[i] = (own_rate / 3)
-        if (a[45] > since):
-            a[45] -= since
+        if (a[46] > since):
+            a[46] -= since
             return False
-        a[45] = 0.0
+        a[46] = 0.0
     else:
-        _t3 = (a[45] + since)
-        a[45] = (2.0 if 2.0 < _t3 else _t3)
+        _t3 = (a[46] + since)
+        a[46] = (2.0 if 2.0 < _t3 else _t3)
     share = (since / (1.0 + since))
     _t4 = (16.0 * own_force)
-    a[43] += (share * ((_t4 if _t4 < force else force) - a[43]))
+    a[44] += (share * ((_t4 if _t4 < force else force) - a[44]))
     _t5 = (16.0 * own_rate)
-    a[44] += (share * ((_t5 if _t5 < rate else rate) - a[44]))
+    a[45] += (share * ((_t5 if _t5 < rate else rate) - a[45]))
     return True
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
@@ -1002,7 +1002,7 @@ cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_n
     if (memory[20] > 0):
         odds = 0.0
         for i in range(6):
-            _t1 = state.auxiliary[(56 + i)]
+            _t1 = state.auxiliary[(57 + i)]
             odds = (_t1 if _t1 > odds else odds)
         source_health_blame_frozen(memory, (odds / (1 + odds)))
 
@@ -1045,22 +1045,22 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
             sensed = 0.0
             for j in range(3):
                 sensed += (turn[((0 + (3 * j)) + i)] * values[(first + j)])
-            moved[i] = fabs((sensed - a[((46 + first) + i)]))
-            a[((46 + first) + i)] = sensed
-            _t1 = a[(54 + kind)]
+            moved[i] = fabs((sensed - a[((47 + first) + i)]))
+            a[((47 + first) + i)] = sensed
+            _t1 = a[(55 + kind)]
             _t2 = fabs(sensed)
-            a[(54 + kind)] = (_t2 if _t2 > _t1 else _t1)
+            a[(55 + kind)] = (_t2 if _t2 > _t1 else _t1)
             if (moved[i] > 1e-09):
                 same = False
-                if ((a[(52 + kind)] == 0) or (moved[i] < a[(52 + kind)])):
-                    a[(52 + kind)] = moved[i]
-        least, lively = (4.0 * a[(52 + kind)]), 0
+                if ((a[(53 + kind)] == 0) or (moved[i] < a[(53 + kind)])):
+                    a[(53 + kind)] = moved[i]
+        least, lively = (4.0 * a[(53 + kind)]), 0
         for i in range(3):
             lively += (1 if (moved[i] > least) else 0)
         for i in range(3):
             k = (first + i)
             changed = (moved[i] > 1e-09)
-            _t3 = a[(56 + k)]
+            _t3 = a[(57 + k)]
             _t4 = 1e-06
             odds = (_t4 if _t4 > _t3 else _t3)
             if changed:
@@ -1069,16 +1069,16 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
                 odds = (_t6 if _t6 > _t5 else _t5)
             if ((lively - (1 if (moved[i] > least) else 0)) == 2):
                 if (not changed):
-                    _t7 = (1 - a[(62 + k)])
+                    _t7 = (1 - a[(63 + k)])
                     _t8 = (0.3333333333333333 if 0.3333333333333333 > _t7 else _t7)
                     chance = (0.95 if 0.95 < _t8 else _t8)
                     _t9 = (odds / chance)
                     odds = (1000.0 if 1000.0 < _t9 else _t9)
-                a[(62 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(62 + k)]))
-            a[(56 + k)] = odds
+                a[(63 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(63 + k)]))
+            a[(57 + k)] = odds
             if (odds > worst):
                 worst = odds
-                saturated = (fabs(a[(46 + k)]) >= a[(54 + kind)])
+                saturated = (fabs(a[(47 + k)]) >= a[(55 + kind)])
                 place = ((1.0 + k) + (6 if saturated else 0))
     memory[20] = place
     return same
@@ -1308,7 +1308,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
-            state.auxiliary[42] = 0.0
+            state.auxiliary[43] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     if ((model == 2) and (not fused)):
@@ -1879,6 +1879,39 @@ cdef bint motion_constraints_rests(State* state, Parameters* params) noexcept no
             if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= params.still_wheel)):
                 return False
     return heard
+
+cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt, Parameters* params) noexcept nogil:
+    cdef double _t1[3 * 3]
+    cdef double* down_e
+    cdef double rate_e[3]
+    cdef double _t2[3 * 3]
+    cdef double _t3[3]
+    cdef int _i
+    cdef int64_t i
+    cdef double variance
+    cdef int64_t j
+    cdef double missing
+    if ((state.stamps[10] != 2) or (not motion_constraints_rests(state, params)) or motion_constraints_carried(state, 0.0, params)):
+        state.auxiliary[42] = 0.0
+        return
+    wgs84_mat_ne(state.nominal, _t1)
+    down_e = _t1 + (2) * 3
+    model_mat_eb(state, _t2)
+    for _i in range(3):
+        _t3[_i] = (rate_b[_i] - (state.nominal + 10)[_i])
+    rotation_times(_t2, _t3, rate_e)
+    rate_e[2] -= 7.292115e-05
+    for i in range(3):
+        state.auxiliary[42] += ((down_e[i] * rate_e[i]) * dt)
+    variance = 0.0
+    for i in range(3):
+        for j in range(3):
+            variance += ((down_e[i] * state.covariance[((6 + i)) * n + (6 + j)]) * down_e[j])
+    missing = (portable_square(state.auxiliary[42]) - variance)
+    if (missing > 0):
+        for i in range(3):
+            for j in range(3):
+                state.covariance[((6 + i)) * n + (6 + j)] += (missing * (down_e[i] * down_e[j]))
 
 cdef bint motion_constraints_is_carried(State* state, Parameters* params) noexcept nogil:
     return (motion_constraints_rests(state, params) and motion_constraints_carried(state, 0.0, params))
@@ -2609,7 +2642,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     cdef State rival
     cdef int64_t k
     state.auxiliary[41] = 1e-06
-    if (state.auxiliary[68] != 0):
+    if (state.auxiliary[69] != 0):
         return
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
@@ -2702,7 +2735,7 @@ cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nog
     cdef State rival
     cdef int _i
     cdef int64_t k
-    if (state.auxiliary[68] != 0):
+    if (state.auxiliary[69] != 0):
         return
     if (state.stamps[22] == 0):
         state.auxiliary[40] = 1.0
@@ -2797,7 +2830,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[42] + portable_square((since / 200.0)))
+    _t1 = (state.auxiliary[43] + portable_square((since / 200.0)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
@@ -2873,7 +2906,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
         if (not ((slot == 1) and (other == 0))):
             rivals_close_slot(state, other)
     if (slot == 0):
-        state.auxiliary[42] = 0.5
+        state.auxiliary[43] = 0.5
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
@@ -3322,7 +3355,7 @@ cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* par
     cdef State rival
     begin = (<int64_t>(state.stamps[0]))
     step_advance(state, t_ns, imu, params)
-    if ((state.stamps[22] > 0) and (state.auxiliary[68] != 0)):
+    if ((state.stamps[22] > 0) and (state.auxiliary[69] != 0)):
         rivals_close_all(state)
     if (state.stamps[22] > 0):
         for slot in range(4):
@@ -3513,6 +3546,7 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     step_hold(state, row.values, t_ns)
     a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
+    motion_constraints_doubt_turn(state, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
     cdef double* a
@@ -3525,7 +3559,7 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
         a[(0 + i)] = _t1
         a[(6 + i)] = _t1
         a[(3 + i)] = values[(3 + i)]
-        if (a[68] == 0.0):
+        if (a[69] == 0.0):
             a[(9 + i)] = values[(3 + i)]
 
 cdef void step_guard(State* state) noexcept nogil:
@@ -3960,17 +3994,17 @@ cdef void strapdown_begin_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[68] == 0.0):
-        a[68] = 1.0
+    if (a[69] == 0.0):
+        a[69] = 1.0
         for _i in range(3):
-            (a + 69)[_i] = (state.nominal + 10)[_i]
+            (a + 70)[_i] = (state.nominal + 10)[_i]
         for i in range(3):
             for j in range(3):
-                a[((72 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
+                a[((73 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
     for _i in range(3):
-        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 69)[_i])
+        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 70)[_i])
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 69)[_i]
+        (state.nominal + 10)[_i] = (a + 70)[_i]
     a[36] = (0.05 * 0.05)
 
 cdef void strapdown_end_coasting(State* state) noexcept nogil:
@@ -3983,11 +4017,11 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[68] == 0.0):
+    if (a[69] == 0.0):
         return
-    a[68] = 0.0
+    a[69] = 0.0
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 69)[_i]
+        (state.nominal + 10)[_i] = (a + 70)[_i]
     for i in range(3):
         for _i in range(n):
             (p + ((bias + i)) * n)[_i] = 0.0
@@ -3995,7 +4029,7 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
             (p + (bias + i))[_i * n] = 0.0
     for i in range(3):
         for j in range(3):
-            p[((bias + i)) * n + (bias + j)] = a[((72 + (3 * i)) + j)]
+            p[((bias + i)) * n + (bias + j)] = a[((73 + (3 * i)) + j)]
 
 cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double* x
