@@ -9,7 +9,7 @@ from fusiond.filter.measurement_update import project, update_projected
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
 from fusiond.filter.observations.model import Observation, mat_eb, with_rate_noise
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import is_stuck
+from fusiond.filter.source_health import is_stuck, is_trusted
 from fusiond.filter.state import (
     ALIVE,
     ATTITUDE,
@@ -95,10 +95,11 @@ def carried(state: FilterState, wheel_speed: float, params: Parameters) -> bool:
 
 @compiled
 def rests(state: FilterState, params: Parameters) -> bool:
-    """Whether every wheel that was heard lately is at rest, and one was."""
+    """Whether every wheel that was heard lately, and is trusted, is at rest, and one was."""
     heard = False
     for i in params.wheels:
-        if state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS:
+        fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS
+        if fresh and is_trusted(state.memory[i]):
             heard = True
             if not abs(state.memory[i, LAST_SPEED]) <= params.still_wheel:
                 return False

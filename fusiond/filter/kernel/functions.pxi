@@ -1341,6 +1341,8 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
         return
     if ((not gnss) and (state.stamps[22] > 0)):
         return
+    if (same and (not source_health_is_trusted(memory))):
+        return
     wheel = ((model == 2) and source_health_is_trusted(memory))
     if (wheel and (not motion_constraints_carried(state, memory[0], params)) and rivals_wheels_contradict(state, params)):
         rivals_suspect_motion(state, 0.01)
@@ -1871,10 +1873,12 @@ cdef bint motion_constraints_rests(State* state, Parameters* params) noexcept no
     cdef bint heard
     cdef int64_t i
     cdef int64_t _k1
+    cdef bint fresh
     heard = False
     for _k1 in range(params.wheels_count):
         i = params.wheels[_k1]
-        if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
+        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000)
+        if (fresh and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
             heard = True
             if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= params.still_wheel)):
                 return False
