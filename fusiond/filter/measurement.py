@@ -214,15 +214,18 @@ def _judge(
     memory, stamps, model = state.memory[source], state.source_stamps[source], params.models[source]
     gnss = model in (GNSS_POSITION, GNSS_VELOCITY)
     if memory[EXCLUDED] != 0:
-        distance = 0.0
-        for a in range(m):
-            distance += whitened[a] * whitened[a]
-        if rivals.returns(state, source, distance, m, params):
-            memory[EXCLUDED] = 0.0
+        if model == GNSS_VELOCITY:
+            if source_health.is_due(stamps, t_ns, correlation):
+                source_health.judge(memory, stamps, whitened, m, same, t_ns)
+        elif rivals.fits_again(state, source, whitened, m, params):
             source_health.begin(memory)
+        if source_health.odds_of_bias(memory) < rivals.BEGIN:
+            memory[EXCLUDED] = 0.0
         return
     if not gnss and state.stamps[ALIVE] > 0:
         return
+    if same and not source_health.is_trusted(memory):
+        return  # it goes on repeating itself: that it happens to be right, at rest say, proves nothing
     wheel = model == WHEEL_SPEED and source_health.is_trusted(memory)
     if wheel and not carried(state, memory[LAST_SPEED], params) and rivals.wheels_contradict(state, params):
         rivals.suspect_motion(state, rivals.BEGIN)
@@ -347,6 +350,8 @@ def _suspect_state(state: FilterState, source: int, values: Vector, seen: Observ
     odds = state.bank[rivals.RECEIVER, 0]
     if not odds > 0 or state.bank[rivals.RETURN, 0] > 0 or state.stamps[SUSPECT] != source:
         return
+    if state.memory[source, EXCLUDED] != 0:
+        return  # what it says was weighed when it was found to lie
     wrong = rivals.wrong(state, is_carried(state, params))
     odds *= wrong / (1 - wrong) / source_health.PRIOR_BIASED
     if odds < rivals.BEGIN * (1 + state.bank[rivals.RECEIVER, 0]):

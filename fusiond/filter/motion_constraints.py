@@ -7,14 +7,16 @@ import numpy as np
 from fusiond.filter import rivals
 from fusiond.filter.measurement_update import project, update_projected
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
-from fusiond.filter.observations.model import Observation, with_rate_noise
+from fusiond.filter.observations.model import Observation, mat_eb, with_rate_noise
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import is_stuck
+from fusiond.filter.source_health import is_stuck, is_trusted
 from fusiond.filter.state import (
     ALIVE,
+    ATTITUDE,
     CONSTRAINT_FUSED,
     CONSTRAINT_RATIO,
     CONSTRAINT_REJECTED,
+    GYRO_BIAS_B,
     INTERVAL,
     LAST_SPEED,
     LOWEST_SPEED,
@@ -22,17 +24,23 @@ from fusiond.filter.state import (
     MEAN_RATE_B,
     MEAN_WEIGHT,
     NEVER,
+    PHASE,
+    POSITION_E,
+    RUNNING,
     SCATTER_FORCE,
     SCATTER_RATE,
     SMOOTH_FORCE_B,
     T_CONSTRAINT,
     T_LAST,
     T_STILL,
+    TURNED_AT_REST,
     FilterState,
     T,
 )
 from fusiond.maths.portable import exp, square
+from fusiond.maths.rotation import times
 from fusiond.maths.typed import Vector3, compiled
+from fusiond.maths.wgs84 import EARTH_RATE, mat_ne
 from fusiond.units import SECOND
 
 MEAN_TIME = 0.5  # s, time constant of the exponential means
@@ -87,14 +95,38 @@ def carried(state: FilterState, wheel_speed: float, params: Parameters) -> bool:
 
 @compiled
 def rests(state: FilterState, params: Parameters) -> bool:
-    """Whether every wheel that was heard lately is at rest, and one was."""
+    """Whether every wheel that was heard lately, and is trusted, is at rest, and one was."""
     heard = False
     for i in params.wheels:
-        if state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS:
+        fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS
+        if fresh and is_trusted(state.memory[i]):
             heard = True
             if not abs(state.memory[i, LAST_SPEED]) <= params.still_wheel:
                 return False
     return heard
+
+
+@compiled
+def doubt_turn(state: FilterState, rate_b: Vector3, dt: float, params: Parameters) -> None:
+    """Take one angular rate (3,) [rad/s], `dt` [s] long, as doubtful while all wheels rest and nothing says that the vehicle
+    is carried: it may turn on a plate, or the gyro lies. So its heading is then at least as uncertain as it has turned."""
+    if state.stamps[PHASE] != RUNNING or not rests(state, params) or carried(state, 0.0, params):
+        state.auxiliary[TURNED_AT_REST] = 0.0
+        return
+    down_e = mat_ne(state.nominal[POSITION_E])[2]
+    rate_e = times(mat_eb(state), rate_b - state.nominal[GYRO_BIAS_B])
+    rate_e[2] -= EARTH_RATE
+    for i in range(3):
+        state.auxiliary[TURNED_AT_REST] += down_e[i] * rate_e[i] * dt
+    variance = 0.0
+    for i in range(3):
+        for j in range(3):
+            variance += down_e[i] * state.covariance[ATTITUDE.start + i, ATTITUDE.start + j] * down_e[j]
+    missing = square(state.auxiliary[TURNED_AT_REST]) - variance
+    if missing > 0:
+        for i in range(3):
+            for j in range(3):
+                state.covariance[ATTITUDE.start + i, ATTITUDE.start + j] += missing * (down_e[i] * down_e[j])
 
 
 @compiled

@@ -32,7 +32,6 @@ from fusiond.filter.state import (
     INERTIAL_ODDS,
     LAST_RATIO,
     MAIN_WEIGHT,
-    MEAN_NIS,
     POSITION,
     POSITION_E,
     RESET_SOURCE,
@@ -49,7 +48,7 @@ from fusiond.filter.state import (
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
-from fusiond.maths.typed import ErrorRows3, Matrix3, Vector3, compiled
+from fusiond.maths.typed import ErrorRows3, Matrix3, Vector, Vector3, compiled
 from fusiond.units import SECOND
 
 RIVALS = 4
@@ -57,7 +56,6 @@ INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while t
 LEAST_ODDS = 1e-6  # of the inertial sensor having lied, while nothing speaks for it
 BEGIN = 0.01  # odds with which a rival begins
 END = 1e-7  # and below which it is given up
-GOOD_NIS = 1.5  # mean squared innovation per axis, in sigmas, of a receiver that does not lie
 LEAD = 100.0  # odds against all others with which a rival leads, where no loss says otherwise
 LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, or goes where that is, at equal losses
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
@@ -301,13 +299,16 @@ def suspect_receiver(state: FilterState, source: int, params: Parameters) -> boo
 
 
 @compiled
-def returns(state: FilterState, source: int, distance: float, m: int, params: Parameters) -> bool:
-    """Whether a source of a receiver that was found to lie is taken back, by its squared whitened innovation on `m` axes: it
-    reads what a good one does on average. A velocity may lie by little for long: while its position is a lie, it must have
-    read so for a while."""
-    position = position_of(source, params)
-    alone = source != position and state.memory[position, EXCLUDED] != 0
-    return distance <= 2 * m and not (alone and state.memory[source, MEAN_NIS] > GOOD_NIS)
+def fits_again(state: FilterState, source: int, whitened: Vector3, m: int, params: Parameters) -> bool:
+    """Whether the positions of a receiver that was found to lie are taken back: by its whitened innovation (m,), it reads
+    what a good one does on average. It must not be said of a receiver whose velocity still lies: a lie begins small."""
+    companion = int(params.model_parameters[source, COMPANION])
+    if companion >= 0 and state.memory[companion, EXCLUDED] != 0:
+        return False
+    distance = 0.0
+    for a in range(m):
+        distance += whitened[a] * whitened[a]
+    return distance <= 2 * m
 
 
 @compiled
@@ -407,11 +408,17 @@ def _lead(state: FilterState, slot: int, params: Parameters) -> None:
 def exclude(state: FilterState, suspect: int, excluded: float, params: Parameters) -> None:
     """Exclude a receiver, or take it back; its health begins anew."""
     companion = int(params.model_parameters[suspect, COMPANION])
-    state.memory[suspect, EXCLUDED] = excluded
-    begin(state.memory[suspect])
+    _exclude(state.memory[suspect], excluded)
     if companion >= 0:
-        state.memory[companion, EXCLUDED] = excluded
-        begin(state.memory[companion])
+        _exclude(state.memory[companion], excluded)
+
+
+@compiled
+def _exclude(memory: Vector, excluded: float) -> None:
+    memory[EXCLUDED] = excluded
+    begin(memory)
+    if excluded != 0:
+        distrust(memory)
 
 
 @compiled

@@ -42,6 +42,7 @@ from fusiond.maths.typed import Array, Matrix3, Stamps, Vector, Vector3, compile
 JUDGE_NS = 50_000_000  # samples closer than this share their error
 MEAN_STATUS_TIME = 20.0  # s: how long a source keeps its status
 PRIOR = (0.997, 0.001, 0.001, 0.001)  # nominal, noisy, biased, frozen: what it becomes then
+PRIOR_OF_LIAR = (0.499, 0.001, 0.499, 0.001)  # the same of a source whose receiver was found to lie
 PRIOR_BIASED = PRIOR[2]
 OUTLIERS = 0.01  # share of readings that are off whatever the source is
 OUTLIER_VARIANCE = 100.0  # of such a reading, per axis, in units of S
@@ -133,7 +134,8 @@ def judge(memory: Vector, stamps: Stamps, whitened: Vector3, m: int, same: bool,
     stamps[T_JUDGED] = t_ns
     blurred = 1 - exp(-elapsed / MEAN_STATUS_TIME)
     for i in range(4):
-        memory[BEFORE.start + i] = memory[NOMINAL + i] + blurred * (PRIOR[i] - memory[NOMINAL + i])
+        usual = PRIOR[i] if memory[EXCLUDED] == 0 else PRIOR_OF_LIAR[i]
+        memory[BEFORE.start + i] = memory[NOMINAL + i] + blurred * (usual - memory[NOMINAL + i])
     look(memory, whitened, m, same)
     _follow_bias(memory, whitened, m)
 

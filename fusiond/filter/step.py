@@ -16,7 +16,7 @@ import math
 from fusiond.filter import gnss_error, heading_bank, inertial_sample, initial_alignment, source_health
 from fusiond.filter.hot_start import has_state
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
-from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, rests, roll, watch
+from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, doubt_turn, rests, roll, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, GNSS_YAW, IMU, WHEEL_SPEED, gnss_velocity
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rivals import RIVALS, close_all, mix
@@ -362,6 +362,7 @@ def keep_sample(state: FilterState, row: Row, params: Parameters) -> None:
     hold(state, row["values"], t_ns)
     a[RATE_VARIANCE] = params.noise.gyro / max(dt, inertial_sample.MIN_SPAN) if dt > 0 else 0.0
     watch(state, a[HELD_FORCE_B], a[HELD_RATE_B], dt, params)
+    doubt_turn(state, a[HELD_RATE_B], dt, params)
 
 
 @compiled

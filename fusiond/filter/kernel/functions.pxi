@@ -2,6 +2,7 @@
 
 
 cdef double[4] PRIOR = [0.997, 0.001, 0.001, 0.001]
+cdef double[4] PRIOR_OF_LIAR = [0.499, 0.001, 0.499, 0.001]
 
 # ---------------- fusiond.maths.linear
 
@@ -861,9 +862,9 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
         force += portable_square((values[i] - a[(0 + i)]))
         rate += portable_square((values[(3 + i)] - a[(3 + i)]))
     white = (6.0 / (0.0001 if 0.0001 > elapsed else elapsed))
-    _t2 = a[43]
+    _t2 = a[44]
     _t3 = (white * params.noise.accel)
-    _t4 = a[44]
+    _t4 = a[45]
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
@@ -893,7 +894,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         return False
     since = inertial_sample_since_last(state, t_ns, params)
-    if (not (state.auxiliary[45] > since)):
+    if (not (state.auxiliary[46] > since)):
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -930,7 +931,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     t_ns = (<int64_t>row.t_ns)
     since = inertial_sample_since_last(state, t_ns, params)
     if (since == INFINITY):
-        a[45] = 0.0
+        a[46] = 0.0
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -950,18 +951,18 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
             else:
                 row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
                 row.variance[i] = (own_rate / 3)
-        if (a[45] > since):
-            a[45] -= since
+        if (a[46] > since):
+            a[46] -= since
             return False
-        a[45] = 0.0
+        a[46] = 0.0
     else:
-        _t3 = (a[45] + since)
-        a[45] = (2.0 if 2.0 < _t3 else _t3)
+        _t3 = (a[46] + since)
+        a[46] = (2.0 if 2.0 < _t3 else _t3)
     share = (since / (1.0 + since))
     _t4 = (16.0 * own_force)
-    a[43] += (share * ((_t4 if _t4 < force else force) - a[43]))
+    a[44] += (share * ((_t4 if _t4 < force else force) - a[44]))
     _t5 = (16.0 * own_rate)
-    a[44] += (share * ((_t5 if _t5 < rate else rate) - a[44]))
+    a[45] += (share * ((_t5 if _t5 < rate else rate) - a[45]))
     return True
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
@@ -1013,15 +1014,15 @@ cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_n
     a = state.auxiliary
     same, fine = inertial_sample_judge_axes(state, values, params), False
     for kind in range(2):
-        change = (a[43] if (kind == 0) else a[44])
-        if (change >= (3 * portable_square((4.0 * a[(52 + kind)])))):
+        change = (a[44] if (kind == 0) else a[45])
+        if (change >= (3 * portable_square((4.0 * a[(53 + kind)])))):
             fine = True
     if (fine or (not same)):
         source_health_judge_repetition(memory, state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE, same, t_ns)
     if (memory[20] > 0):
         odds = 0.0
         for i in range(6):
-            _t1 = state.auxiliary[(56 + i)]
+            _t1 = state.auxiliary[(57 + i)]
             odds = (_t1 if _t1 > odds else odds)
         source_health_blame_frozen(memory, (odds / (1 + odds)))
 
@@ -1064,22 +1065,22 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
             sensed = 0.0
             for j in range(3):
                 sensed += (turn[((0 + (3 * j)) + i)] * values[(first + j)])
-            moved[i] = fabs((sensed - a[((46 + first) + i)]))
-            a[((46 + first) + i)] = sensed
-            _t1 = a[(54 + kind)]
+            moved[i] = fabs((sensed - a[((47 + first) + i)]))
+            a[((47 + first) + i)] = sensed
+            _t1 = a[(55 + kind)]
             _t2 = fabs(sensed)
-            a[(54 + kind)] = (_t2 if _t2 > _t1 else _t1)
+            a[(55 + kind)] = (_t2 if _t2 > _t1 else _t1)
             if (moved[i] > 1e-09):
                 same = False
-                if ((a[(52 + kind)] == 0) or (moved[i] < a[(52 + kind)])):
-                    a[(52 + kind)] = moved[i]
-        least, lively = (4.0 * a[(52 + kind)]), 0
+                if ((a[(53 + kind)] == 0) or (moved[i] < a[(53 + kind)])):
+                    a[(53 + kind)] = moved[i]
+        least, lively = (4.0 * a[(53 + kind)]), 0
         for i in range(3):
             lively += (1 if (moved[i] > least) else 0)
         for i in range(3):
             k = (first + i)
             changed = (moved[i] > 1e-09)
-            _t3 = a[(56 + k)]
+            _t3 = a[(57 + k)]
             _t4 = 1e-06
             odds = (_t4 if _t4 > _t3 else _t3)
             if changed:
@@ -1088,16 +1089,16 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
                 odds = (_t6 if _t6 > _t5 else _t5)
             if ((lively - (1 if (moved[i] > least) else 0)) == 2):
                 if (not changed):
-                    _t7 = (1 - a[(62 + k)])
+                    _t7 = (1 - a[(63 + k)])
                     _t8 = (0.3333333333333333 if 0.3333333333333333 > _t7 else _t7)
                     chance = (0.95 if 0.95 < _t8 else _t8)
                     _t9 = (odds / chance)
                     odds = (1000.0 if 1000.0 < _t9 else _t9)
-                a[(62 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(62 + k)]))
-            a[(56 + k)] = odds
+                a[(63 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(63 + k)]))
+            a[(57 + k)] = odds
             if (odds > worst):
                 worst = odds
-                saturated = (fabs(a[(46 + k)]) >= a[(54 + kind)])
+                saturated = (fabs(a[(47 + k)]) >= a[(55 + kind)])
                 place = ((1.0 + k) + (6 if saturated else 0))
     memory[20] = place
     return same
@@ -1333,7 +1334,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
-            state.auxiliary[42] = 0.0
+            state.auxiliary[43] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     if ((model == 2) and (not fused)):
@@ -1350,22 +1351,23 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     cdef int64_t* stamps
     cdef int64_t model
     cdef bint gnss
-    cdef double distance
-    cdef int64_t a
     cdef bint wheel
     memory = state.memory + (source) * MEMORY_SIZE
     stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
     model = params.models[source]
     gnss = (model == 0 or model == 1)
     if (memory[18] != 0):
-        distance = 0.0
-        for a in range(m):
-            distance += (whitened[a] * whitened[a])
-        if rivals_returns(state, source, distance, m, params):
-            memory[18] = 0.0
+        if (model == 1):
+            if source_health_is_due(stamps, t_ns, correlation):
+                source_health_judge(memory, stamps, whitened, m, same, t_ns)
+        elif rivals_fits_again(state, source, whitened, m, params):
             source_health_begin(memory)
+        if (source_health_odds_of_bias(memory) < 0.01):
+            memory[18] = 0.0
         return
     if ((not gnss) and (state.stamps[22] > 0)):
+        return
+    if (same and (not source_health_is_trusted(memory))):
         return
     wheel = ((model == 2) and source_health_is_trusted(memory))
     if (wheel and (not motion_constraints_carried(state, memory[0], params)) and rivals_wheels_contradict(state, params)):
@@ -1495,6 +1497,8 @@ cdef void measurement__suspect_state(State* state, int64_t source, double* value
     cdef State rival
     odds = state.bank[(1) * BLOCK + 0]
     if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[23] != source)):
+        return
+    if (state.memory[(source) * MEMORY_SIZE + 18] != 0):
         return
     wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
     odds *= ((wrong / (1 - wrong)) / 0.001)
@@ -1895,14 +1899,49 @@ cdef bint motion_constraints_rests(State* state, Parameters* params) noexcept no
     cdef bint heard
     cdef int64_t i
     cdef int64_t _k1
+    cdef bint fresh
     heard = False
     for _k1 in range(params.wheels_count):
         i = params.wheels[_k1]
-        if ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000):
+        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000)
+        if (fresh and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
             heard = True
             if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= params.still_wheel)):
                 return False
     return heard
+
+cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt, Parameters* params) noexcept nogil:
+    cdef double _t1[3 * 3]
+    cdef double* down_e
+    cdef double rate_e[3]
+    cdef double _t2[3 * 3]
+    cdef double _t3[3]
+    cdef int _i
+    cdef int64_t i
+    cdef double variance
+    cdef int64_t j
+    cdef double missing
+    if ((state.stamps[10] != 2) or (not motion_constraints_rests(state, params)) or motion_constraints_carried(state, 0.0, params)):
+        state.auxiliary[42] = 0.0
+        return
+    wgs84_mat_ne(state.nominal, _t1)
+    down_e = _t1 + (2) * 3
+    model_mat_eb(state, _t2)
+    for _i in range(3):
+        _t3[_i] = (rate_b[_i] - (state.nominal + 10)[_i])
+    rotation_times(_t2, _t3, rate_e)
+    rate_e[2] -= 7.292115e-05
+    for i in range(3):
+        state.auxiliary[42] += ((down_e[i] * rate_e[i]) * dt)
+    variance = 0.0
+    for i in range(3):
+        for j in range(3):
+            variance += ((down_e[i] * state.covariance[((6 + i)) * n + (6 + j)]) * down_e[j])
+    missing = (portable_square(state.auxiliary[42]) - variance)
+    if (missing > 0):
+        for i in range(3):
+            for j in range(3):
+                state.covariance[((6 + i)) * n + (6 + j)] += (missing * (down_e[i] * down_e[j]))
 
 cdef bint motion_constraints_is_carried(State* state, Parameters* params) noexcept nogil:
     return (motion_constraints_rests(state, params) and motion_constraints_carried(state, 0.0, params))
@@ -2633,7 +2672,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     cdef State rival
     cdef int64_t k
     state.auxiliary[41] = 1e-06
-    if (state.auxiliary[68] != 0):
+    if (state.auxiliary[69] != 0):
         return
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
@@ -2726,7 +2765,7 @@ cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nog
     cdef State rival
     cdef int _i
     cdef int64_t k
-    if (state.auxiliary[68] != 0):
+    if (state.auxiliary[69] != 0):
         return
     if (state.stamps[22] == 0):
         state.auxiliary[40] = 1.0
@@ -2794,12 +2833,17 @@ cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* para
     rivals_suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
     return (state.bank[(1) * BLOCK + 0] > 0)
 
-cdef bint rivals_returns(State* state, int64_t source, double distance, int64_t m, Parameters* params) noexcept nogil:
-    cdef int64_t position
-    cdef bint alone
-    position = rivals_position_of(source, params)
-    alone = ((source != position) and (state.memory[(position) * MEMORY_SIZE + 18] != 0))
-    return ((distance <= (2 * m)) and (not (alone and (state.memory[(source) * MEMORY_SIZE + 19] > 1.5))))
+cdef bint rivals_fits_again(State* state, int64_t source, double* whitened, int64_t m, Parameters* params) noexcept nogil:
+    cdef int64_t companion
+    cdef double distance
+    cdef int64_t a
+    companion = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 11]))
+    if ((companion >= 0) and (state.memory[(companion) * MEMORY_SIZE + 18] != 0)):
+        return False
+    distance = 0.0
+    for a in range(m):
+        distance += (whitened[a] * whitened[a])
+    return (distance <= (2 * m))
 
 cdef int64_t rivals_position_of(int64_t source, Parameters* params) noexcept nogil:
     cdef int64_t i
@@ -2816,7 +2860,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[42] + portable_square((since / 200.0)))
+    _t1 = (state.auxiliary[43] + portable_square((since / 200.0)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
@@ -2892,7 +2936,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
         if (not ((slot == 1) and (other == 0))):
             rivals_close_slot(state, other)
     if (slot == 0):
-        state.auxiliary[42] = 0.5
+        state.auxiliary[43] = 0.5
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
@@ -2912,11 +2956,15 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
 cdef void rivals_exclude(State* state, int64_t suspect, double excluded, Parameters* params) noexcept nogil:
     cdef int64_t companion
     companion = (<int64_t>(params.model_parameters[(suspect) * PARAMETERS + 11]))
-    state.memory[(suspect) * MEMORY_SIZE + 18] = excluded
-    source_health_begin(state.memory + (suspect) * MEMORY_SIZE)
+    rivals__exclude(state.memory + (suspect) * MEMORY_SIZE, excluded)
     if (companion >= 0):
-        state.memory[(companion) * MEMORY_SIZE + 18] = excluded
-        source_health_begin(state.memory + (companion) * MEMORY_SIZE)
+        rivals__exclude(state.memory + (companion) * MEMORY_SIZE, excluded)
+
+cdef void rivals__exclude(double* memory, double excluded) noexcept nogil:
+    memory[18] = excluded
+    source_health_begin(memory)
+    if (excluded != 0):
+        source_health_distrust(memory)
 
 cdef void rivals_mix(State* state) noexcept nogil:
     cdef double total
@@ -3002,6 +3050,7 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
     cdef double elapsed
     cdef double blurred
     cdef int64_t i
+    cdef double usual
     if ((((memory[4] + memory[5]) + memory[6]) + memory[7]) == 0):
         source_health_begin(memory)
     elapsed = 20.0
@@ -3010,7 +3059,8 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
     stamps[4] = t_ns
     blurred = (1 - portable_exp(((-elapsed) / 20.0)))
     for i in range(4):
-        memory[(14 + i)] = (memory[(4 + i)] + (blurred * (PRIOR[i] - memory[(4 + i)])))
+        usual = (PRIOR[i] if (memory[18] == 0) else PRIOR_OF_LIAR[i])
+        memory[(14 + i)] = (memory[(4 + i)] + (blurred * (usual - memory[(4 + i)])))
     source_health_look(memory, whitened, m, same)
     source_health__follow_bias(memory, whitened, m)
 
@@ -3347,7 +3397,7 @@ cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* par
     cdef State rival
     begin = (<int64_t>(state.stamps[0]))
     step_advance(state, t_ns, imu, params)
-    if ((state.stamps[22] > 0) and (state.auxiliary[68] != 0)):
+    if ((state.stamps[22] > 0) and (state.auxiliary[69] != 0)):
         rivals_close_all(state)
     if (state.stamps[22] > 0):
         for slot in range(4):
@@ -3538,6 +3588,7 @@ cdef void step_keep_sample(State* state, Row* row, Parameters* params) noexcept 
     step_hold(state, row.values, t_ns)
     a[36] = ((params.noise.gyro / (0.0001 if 0.0001 > dt else dt)) if (dt > 0) else 0.0)
     motion_constraints_watch(state, a, a + 3, dt, params)
+    motion_constraints_doubt_turn(state, a + 3, dt, params)
 
 cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
     cdef double* a
@@ -3550,7 +3601,7 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
         a[(0 + i)] = _t1
         a[(6 + i)] = _t1
         a[(3 + i)] = values[(3 + i)]
-        if (a[68] == 0.0):
+        if (a[69] == 0.0):
             a[(9 + i)] = values[(3 + i)]
 
 cdef void step_guard(State* state) noexcept nogil:
@@ -3985,17 +4036,17 @@ cdef void strapdown_begin_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[68] == 0.0):
-        a[68] = 1.0
+    if (a[69] == 0.0):
+        a[69] = 1.0
         for _i in range(3):
-            (a + 69)[_i] = (state.nominal + 10)[_i]
+            (a + 70)[_i] = (state.nominal + 10)[_i]
         for i in range(3):
             for j in range(3):
-                a[((72 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
+                a[((73 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
     for _i in range(3):
-        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 69)[_i])
+        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 70)[_i])
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 69)[_i]
+        (state.nominal + 10)[_i] = (a + 70)[_i]
     a[36] = (0.05 * 0.05)
 
 cdef void strapdown_end_coasting(State* state) noexcept nogil:
@@ -4008,11 +4059,11 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[68] == 0.0):
+    if (a[69] == 0.0):
         return
-    a[68] = 0.0
+    a[69] = 0.0
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 69)[_i]
+        (state.nominal + 10)[_i] = (a + 70)[_i]
     for i in range(3):
         for _i in range(n):
             (p + ((bias + i)) * n)[_i] = 0.0
@@ -4020,7 +4071,7 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
             (p + (bias + i))[_i * n] = 0.0
     for i in range(3):
         for j in range(3):
-            p[((bias + i)) * n + (bias + j)] = a[((72 + (3 * i)) + j)]
+            p[((bias + i)) * n + (bias + j)] = a[((73 + (3 * i)) + j)]
 
 cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double* x
