@@ -124,6 +124,7 @@ class Imu(Sensor, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to request from the autopilot, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # mounting roll, pitch, yaw of the sensor's axes against forward-right-down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was measured
+    delay_sigma_ms: NotNegative = 0.0  # initial sigma of that, of the gyro's and of the accelerometer's; 0: not estimated
     accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
     gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
     accel_bias_sigma: NotNegative = 0.3  # initial sigma of the accelerometer bias [m/s^2]

@@ -19,6 +19,7 @@ from fusiond.filter.state import (
     ERROR_SIZE,
     FURTHER_SCALES_ERROR,
     HEIGHT_OFFSET_ERROR,
+    INERTIAL_DELAYS_ERROR,
     MOUNT_ERROR,
     SCALE,
     WIDE_SIZE,
@@ -187,5 +188,7 @@ def _calibrations(config: Config) -> tuple[Array, Array]:
     for barometer in config.barometer.values():
         first[HEIGHT_OFFSET_ERROR] = square(barometer.offset_sigma_m)
         walks[HEIGHT_OFFSET_ERROR] = square(barometer.offset_walk_m)
+    for imu in config.imu.values():
+        first[INERTIAL_DELAYS_ERROR] = square(imu.delay_sigma_ms * 1e-3)
     size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
     return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]
