@@ -70,6 +70,7 @@ class Motion(Section, frozen=True, kw_only=True):
     point_m: Vector = (0.0, 0.0, 0.0)  # where that is so, from the IMU: the middle of the unsteered axle
     lateral_sigma_mps: Positive = 0.2  # sigma of the sideways speed: slip
     vertical_sigma_mps: Positive = 0.3  # sigma of the vertical speed: suspension
+    slip_sigma_deg_per_mps2: NotNegative = 0.5  # of the slip angle that lateral acceleration makes; learnt with the IMU's delay
     interval_s: Seconds = 0.1  # spacing of constraint, zero velocity and zero rotation updates
     minimum_speed_mps: NotNegative = 0.3  # the non-holonomic constraint is not used below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands

@@ -15,6 +15,7 @@ from fusiond.filter.state import (
     INERTIAL_DELAYS_ERROR,
     MOUNT_ERROR,
     SCALE,
+    SLIP_ERROR,
     FilterState,
 )
 
@@ -46,3 +47,4 @@ def _names(params: Parameters) -> Iterator[tuple[int, str, float]]:
     yield HEIGHT_OFFSET_ERROR.start, "height_offset_m", 1.0
     yield INERTIAL_DELAYS_ERROR.start, "gyro_delay_ms", MS_PER_S
     yield INERTIAL_DELAYS_ERROR.start + 1, "accel_delay_ms", MS_PER_S
+    yield SLIP_ERROR.start, "slip_deg_per_mps2", DEGREE

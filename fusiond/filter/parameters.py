@@ -22,6 +22,7 @@ from fusiond.filter.state import (
     INERTIAL_DELAYS_ERROR,
     MOUNT_ERROR,
     SCALE,
+    SLIP_ERROR,
     WIDE_SIZE,
 )
 from fusiond.filter.stored_state import StoredState
@@ -190,5 +191,7 @@ def _calibrations(config: Config) -> tuple[Array, Array]:
         walks[HEIGHT_OFFSET_ERROR] = square(barometer.offset_walk_m)
     for imu in config.imu.values():
         first[INERTIAL_DELAYS_ERROR] = square(imu.delay_sigma_ms * 1e-3)
+        if imu.delay_sigma_ms and config.motion.non_holonomic:
+            first[SLIP_ERROR] = square(math.radians(config.motion.slip_sigma_deg_per_mps2))
     size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
     return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

@@ -1290,7 +1290,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         _t1 = 2
         m = _t1
         seen.m = _t1
-    elif ((state.nominal[33] > 0.05) and source_health_is_used(memory, True)):
+    elif ((state.nominal[34] > 0.05) and source_health_is_used(memory, True)):
         for a in range(m):
             seen.variance[a] = learnt[a]
         rivals_fit_lie(state, &seen, across, spread)
@@ -2478,9 +2478,24 @@ cdef void non_holonomic__observe(State* state, double* parameter, Observation* s
             (seen.jacobian + (i) * n)[_i] = (by + ((1 + i)) * n)[_i]
         seen.innovation[i] = (-velocity_v[(1 + i)])
     seen.variance[0], seen.variance[1] = parameter[3], parameter[4]
+    if ((n > 21) and (state.covariance[(32) * n + 32] > 0)):
+        non_holonomic__slide(state, velocity_v[0], by, seen)
     for _i in range(3):
         out[_i] = velocity_v[_i]
     return
+
+cdef void non_holonomic__slide(State* state, double speed, double* by, Observation* seen) noexcept nogil:
+    cdef double _t1[3]
+    cdef double turn
+    cdef double slip
+    cdef double along
+    model_rate_b(state, _t1)
+    turn, slip = _t1[2], state.nominal[33]
+    along = (fabs(speed) * speed)
+    seen.innovation[0] -= ((slip * along) * turn)
+    axpy(seen.jacobian + (0) * n, (((2 * slip) * fabs(speed)) * turn), by + (0) * n)
+    seen.jacobian[(0) * n + (9 + 2)] -= (slip * along)
+    seen.jacobian[(0) * n + 32] = (along * turn)
 
 # ---------------- fusiond.filter.observations.wheel_speed
 
@@ -2662,7 +2677,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
         rival = hypothesis_of(state, 0)
-        rival.nominal[33] = 1.0
+        rival.nominal[34] = 1.0
         for k in range(3, 15):
             rival.covariance[(k) * n + k] += (0.1 * rivals_lie_variance(k))
     if (state.bank[(3) * BLOCK + 0] == 0):
@@ -2695,7 +2710,7 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
     memset(lie, 0, n * sizeof(double))
     memset(off, 0, 3 * sizeof(double))
     rivals_with_lie(seen, spread, 100.0, widened)
-    if ((not (rival.nominal[33] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
+    if ((not (rival.nominal[34] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
         return 1.0
     for a in range(m):
         solved[a] = seen.innovation[a]
@@ -2874,7 +2889,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     for slot in range(4):
         state.bank[(slot) * BLOCK + 0] = (state.bank[(slot) * BLOCK + 0] / total)
     inertial = hypothesis_of(state, 0)
-    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[33] > 0.05))
+    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[34] > 0.05))
     excluded = (state.memory[((<int64_t>(state.stamps[23]))) * MEMORY_SIZE + 18] != 0)
     for slot in range(4):
         if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 if (young or (excluded and (slot == 0))) else (0.01 / 10))):
@@ -3706,12 +3721,12 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     for _i in range(4):
         (x + 6)[_i] = _t12[_i]
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
-    doubt = x[33]
+    doubt = x[34]
     strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 0.01)), (noise.gyro + (doubt * 0.0001)), noise)
     if (doubt > 0):
         for i in range(3):
             state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.0001) * dt)
-        x[33] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
+        x[34] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
 
 cdef void strapdown_gravity_gradient(double* position_e, double* out) noexcept nogil:
     cdef double r2
