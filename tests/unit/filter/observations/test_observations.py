@@ -34,6 +34,7 @@ from fusiond.filter.state import (
     POSITION_E,
     QUATERNION_EB,
     RATE_B,
+    SLIP,
     SMOOTH_FORCE_B,
     VELOCITY_E,
     WHEEL_SCALE,
@@ -50,7 +51,7 @@ GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
 WHITE = msgspec.structs.replace(GNSS, position_correlation_s=0.0)
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
-STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1])
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0, 0.01, 0.01], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1])
 BAROMETER = Barometer(link="l")
 ANTENNAS = DualAntenna(link="l", offset_deg=50.0)
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
@@ -118,6 +119,7 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     """A state that moves forward along its own axis, with a little of everything else."""
     state = running_state(rng, size=WIDE_SIZE)
     slip = 0.1 if abs(speed) > 1 else 0.01
+    state.nominal[SLIP] = 0.02
     state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
     state.auxiliary[SMOOTH_FORCE_B] = rng.normal((0.0, 0.0, -9.8), 0.5)
     state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
