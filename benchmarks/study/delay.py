@@ -1,5 +1,5 @@
-"""An autopilot whose low-pass filters delay its inertial samples, as ArduPilot Rover's do: what that costs, and what learning
-the delays gives back."""
+"""An autopilot whose low-pass filters delay its inertial samples, as ArduPilot Rover's do: what that costs, and what
+learning the delays gives back."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ CASES = {
 
 
 class Found(NamedTuple):
-    """Horizontal RMSE [m], yaw RMSE [deg] and the largest yaw error in its own sigmas; share of instants with the yaw inside 3
-    sigma; the calibrations at the end, value and sigma; resets."""
+    """Horizontal RMSE [m], yaw RMSE [deg] and the largest yaw error in its own sigmas; share of instants with the yaw inside
+    3 sigma; the calibrations at the end, value and sigma; resets."""
 
     position: float
     yaw: float
@@ -135,11 +135,11 @@ def followed(fusion: Fusion, drive: Recorded) -> Array:
 def delay(runs: int, seed: int) -> Section:
     section = Section("Delay of the inertial sensor")
     section.say(
-        f"{runs} drives of the simulator, seed {seed}: {DRIVE_S:.0f} s at 3 to 6 m/s with bends of 45 to 150 deg, IMU 50 Hz, "
-        "GNSS of some 5 cm at 5 Hz, wheels 20 Hz; lever arms as measured, else the default configuration. A Rover's filters "
-        f"({GYRO_HZ:g} Hz gyro, {ACCEL_HZ:g} Hz accelerometer) delay by {delay_ms(GYRO_HZ):.1f} and "
-        f"{delay_ms(ACCEL_HZ):.1f} ms. Learnt: `imu.delay_sigma_ms` = {SIGMA_MS:g}. Tyres slip: {SLIP} deg per m/s^2. Errors "
-        f"from {FROM_S:.0f} s on; yaw in sigmas: the largest of all runs."
+        f"{runs} drives of the simulator, seed {seed}: {DRIVE_S:.0f} s at 3 to 6 m/s with bends of 45 to 150 deg, IMU "
+        "50 Hz, GNSS of some 5 cm at 5 Hz, wheels 20 Hz; lever arms as measured, else the default configuration. A Rover's "
+        f"filters ({GYRO_HZ:g} Hz gyro, {ACCEL_HZ:g} Hz accelerometer) delay by {delay_ms(GYRO_HZ):.1f} and "
+        f"{delay_ms(ACCEL_HZ):.1f} ms. Learnt: `imu.delay_sigma_ms` = {SIGMA_MS:g}. Tyres slip: {SLIP} deg per m/s^2. "
+        f"Errors from {FROM_S:.0f} s on; yaw in sigmas: the largest of all runs."
     )
     rows = []
     for name, case in CASES.items():
