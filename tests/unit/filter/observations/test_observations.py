@@ -35,6 +35,7 @@ from fusiond.filter.state import (
     QUATERNION_EB,
     RATE_B,
     SLIP,
+    SLIP_ERROR,
     SMOOTH_FORCE_B,
     VELOCITY_E,
     WHEEL_SCALE,
@@ -295,6 +296,20 @@ def test_non_holonomic_takes_the_mount_out() -> None:
     state.nominal[VELOCITY_E] = mat_eb(state) @ (matrix_from_euler(0.0, pitch, yaw).T @ [12.0, 0.0, 0.0])
     seen = found(non_holonomic.observe, state, parameters, parameters)
     np.testing.assert_allclose(seen.innovation, 0.0, atol=1e-12)
+
+
+def test_non_holonomic_lets_tyres_slide_out_of_a_bend() -> None:
+    """In a bend to the right the axle moves to the left, by the slip times lateral acceleration and speed."""
+    state, parameters = FilterState(7, WIDE_SIZE), non_holonomic.parameters(Motion())
+    level = level_state()
+    state.nominal[QUATERNION_EB], state.nominal[POSITION_E] = level.nominal[QUATERNION_EB], level.nominal[POSITION_E]
+    state.nominal[SLIP], state.auxiliary[RATE_B] = 0.01, (0.0, 0.0, 0.2)
+    state.nominal[VELOCITY_E] = mat_eb(state) @ (10.0, -0.01 * 0.2 * 10.0**2, 0.0)
+    unaware = found(non_holonomic.observe, state, parameters, parameters)
+    state.covariance[SLIP_ERROR, SLIP_ERROR] = 1e-4
+    seen = found(non_holonomic.observe, state, parameters, parameters)
+    assert unaware.innovation == pytest.approx([0.2, 0.0], abs=1e-9)
+    assert seen.innovation == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_zero_rotation_allows_for_the_earth() -> None:
