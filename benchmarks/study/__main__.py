@@ -17,6 +17,7 @@ from benchmarks.study import (
     calibration,
     consistency,
     costs,
+    delay,
     faults,
     ferry,
     gaps,
@@ -45,6 +46,7 @@ PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the numbe
     "mismatch": (mismatch.mismatch, 6),
     "rtk": (rtk.rtk, 10),
     "rover": (rover.rover, 20),
+    "delay": (delay.delay, 10),
 }
 
 

@@ -80,6 +80,14 @@ def oddities(config: Config) -> Iterator[str]:
             )
         if delay_ms < 0:
             yield f"{where}: with a delay of {delay_ms:g} ms it would measure the future"
+    for name, imu in config.imu.items():
+        if config.autopilot.kind == "ardupilot" and config.autopilot.link == imu.link and not (
+            imu.delay_ms or imu.delay_sigma_ms
+        ):
+            yield (
+                f"imu.{name}: ArduPilot's low-pass filters delay its samples, by 56 ms on a Rover with INS_GYRO_FILTER 4:"
+                " set delay_ms, or delay_sigma_ms to learn the delays"
+            )
     for key, point in _points(config):
         if max(map(abs, point)) > FAR_M:
             yield f"{key}: {point_in_words(point)} is far from the IMU; is it in metres?"

@@ -70,6 +70,7 @@ class Motion(Section, frozen=True, kw_only=True):
     point_m: Vector = (0.0, 0.0, 0.0)  # where that is so, from the IMU: the middle of the unsteered axle
     lateral_sigma_mps: Positive = 0.2  # sigma of the sideways speed: slip
     vertical_sigma_mps: Positive = 0.3  # sigma of the vertical speed: suspension
+    slip_sigma_deg_per_mps2: NotNegative = 0.5  # initial sigma of the slip angle in bends, learnt where the IMU's delay is
     interval_s: Seconds = 0.1  # spacing of constraint, zero velocity and zero rotation updates
     minimum_speed_mps: NotNegative = 0.3  # the non-holonomic constraint is not used below this speed
     standstill: bool = True  # use zero velocity and zero rotation when the vehicle stands
@@ -124,6 +125,7 @@ class Imu(Sensor, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to request from the autopilot, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # mounting roll, pitch, yaw of the sensor's axes against forward-right-down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was measured
+    delay_sigma_ms: NotNegative = 0.0  # initial sigma of the gyro's delay, and of the accelerometer's; 0: not estimated
     accel_noise: Positive = 0.05  # accelerometer noise density, vibration included [m/s^2/sqrt(Hz)]
     gyro_noise: Positive = 2e-3  # gyro noise density [rad/s/sqrt(Hz)]
     accel_bias_sigma: NotNegative = 0.3  # initial sigma of the accelerometer bias [m/s^2]
@@ -140,7 +142,8 @@ class Imu(Sensor, frozen=True, kw_only=True):
         return {self.message: self.rate_hz}
 
     def description(self, name: str) -> Iterator[str]:
-        yield f"{self.origin()}, {delay_in_words(self.delay_ms)}"
+        learnt = f" +- {self.delay_sigma_ms:g} ms, learnt" if self.delay_sigma_ms else ""
+        yield f"{self.origin()}, {delay_in_words(self.delay_ms)}{learnt}"
         yield f"turned by {vector_in_words(self.rotation_deg)} deg (roll, pitch, yaw) against forward-right-down"
         yield f"noise {self.accel_noise:g} m/s^2/sqrt(Hz), {self.gyro_noise:g} rad/s/sqrt(Hz)"
 

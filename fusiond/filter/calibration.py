@@ -12,8 +12,10 @@ from fusiond.filter.state import (
     DELAYS_ERROR,
     FURTHER_SCALES_ERROR,
     HEIGHT_OFFSET_ERROR,
+    INERTIAL_DELAYS_ERROR,
     MOUNT_ERROR,
     SCALE,
+    SLIP_ERROR,
     FilterState,
 )
 
@@ -43,3 +45,6 @@ def _names(params: Parameters) -> Iterator[tuple[int, str, float]]:
     yield DELAYS_ERROR.start, "delay_ms", MS_PER_S
     yield DELAYS_ERROR.start + 1, "velocity_delay_ms", MS_PER_S
     yield HEIGHT_OFFSET_ERROR.start, "height_offset_m", 1.0
+    yield INERTIAL_DELAYS_ERROR.start, "gyro_delay_ms", MS_PER_S
+    yield INERTIAL_DELAYS_ERROR.start + 1, "accel_delay_ms", MS_PER_S
+    yield SLIP_ERROR.start, "slip_deg_per_mps2", DEGREE

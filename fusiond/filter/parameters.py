@@ -19,8 +19,10 @@ from fusiond.filter.state import (
     ERROR_SIZE,
     FURTHER_SCALES_ERROR,
     HEIGHT_OFFSET_ERROR,
+    INERTIAL_DELAYS_ERROR,
     MOUNT_ERROR,
     SCALE,
+    SLIP_ERROR,
     WIDE_SIZE,
 )
 from fusiond.filter.stored_state import StoredState
@@ -187,5 +189,9 @@ def _calibrations(config: Config) -> tuple[Array, Array]:
     for barometer in config.barometer.values():
         first[HEIGHT_OFFSET_ERROR] = square(barometer.offset_sigma_m)
         walks[HEIGHT_OFFSET_ERROR] = square(barometer.offset_walk_m)
+    for imu in config.imu.values():
+        first[INERTIAL_DELAYS_ERROR] = square(imu.delay_sigma_ms * 1e-3)
+        if imu.delay_sigma_ms and config.motion.non_holonomic:
+            first[SLIP_ERROR] = square(math.radians(config.motion.slip_sigma_deg_per_mps2))
     size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
     return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

@@ -56,6 +56,8 @@ FURTHER_SCALES, FURTHER_SCALES_ERROR = _state(3)  # 1: the same of the second to
 ANTENNA_B, ANTENNA_ERROR = _state(3)  # m, what the antenna's lever arm is more than configured, b axes
 DELAYS, DELAYS_ERROR = _state(2)  # s, what the position's delay is more than configured, the velocity's more than that
 HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR = _state(1)  # m, how much too high the barometer reads
+INERTIAL_DELAYS, INERTIAL_DELAYS_ERROR = _state(2)  # s, what the delays of gyro and accelerometer are more than configured
+SLIP, SLIP_ERROR = _state(1)  # rad per m/s^2: slip angle of the unsteered axle in a bend, out of it
 INERTIAL_DOUBT = _nominal.one()  # 0..1: how much process noise a lie of the inertial sensor still adds; it fades
 NOMINAL_SIZE, WIDE_SIZE = _nominal.size, _error.size
 

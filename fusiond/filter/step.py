@@ -15,6 +15,7 @@ import math
 
 from fusiond.filter import gnss_error, heading_bank, inertial_sample, initial_alignment, source_health
 from fusiond.filter.hot_start import has_state
+from fusiond.filter.inertial_delay import catch_up
 from fusiond.filter.measurement import factor_of, fuse_measurement, remember
 from fusiond.filter.motion_constraints import GNSS_FRESH_NS, carried, constrain, doubt_turn, rests, roll, watch
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, GNSS_YAW, IMU, WHEEL_SPEED, gnss_velocity
@@ -272,6 +273,9 @@ def advance(state: FilterState, t_ns: int, imu: Row | None, params: Parameters) 
     a[RATE_B] = a[HELD_RATE_B] + end * rate_change
     a[RATE_VARIANCE] = params.noise.gyro / (span * 1e-9) * ((1 - end) * (1 - end) + end * end)
     propagate(state, dt, force_b, rate_b, params.noise)
+    if believed:
+        share = float(t_ns - begin) / span
+        catch_up(state, share * force_change, share * rate_change)
     if accel > 0:
         add_white_noise(state.covariance, dt, accel, gyro)
         a[RATE_VARIANCE] += gyro / (span * 1e-9)

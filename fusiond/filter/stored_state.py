@@ -72,7 +72,7 @@ class StoredState(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     accel_bias_variance: ThreeVariances
     calibrations: list[Annotated[float, Meta(ge=-1e6, le=1e6)]]  # values of the error states from CALIBRATIONS on
     calibration_variances: list[Variance]
-    origin: Origin | None = None  # not the filter's, kept with it: that of the local frame sent to an autopilot [deg, deg, m]
+    origin: Origin | None = None  # not the filter's: of the local frame sent to an autopilot
     reset_counter: Annotated[int, Meta(ge=0, le=255)] | None = None  # and the newest number of jumps that it was told of
     checksum: int = 0  # CRC-32 of all the rest
 

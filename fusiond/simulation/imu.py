@@ -1,4 +1,5 @@
-"""The simulated inertial sensor: white noise, wandering bias, vibration in narrow bands, steps of the reading."""
+"""The simulated inertial sensor: white noise, wandering bias, vibration in narrow bands, the autopilot's low-pass filters,
+steps of the reading."""
 
 from __future__ import annotations
 
@@ -50,9 +51,40 @@ def measure(
     gyro_bias, accel_bias = biases(imu, len(t), randoms[0])
     gyro_noise, accel_noise = white(imu, len(t), randoms[1])
     gyro_shake, accel_shake = vibration(imu, t, motion.speed, randoms[2])
-    gyro = stepped(motion.angular_rate_b + gyro_bias + gyro_noise + gyro_shake, imu.gyro_resolution)
-    accel = stepped(motion.specific_force_b + accel_bias + accel_noise + accel_shake, imu.accel_resolution)
-    return gyro, accel, gyro_bias, accel_bias
+    gyro = filtered(motion.angular_rate_b + gyro_bias + gyro_noise + gyro_shake, imu.gyro_filter_hz, imu.rate_hz)
+    accel = filtered(motion.specific_force_b + accel_bias + accel_noise + accel_shake, imu.accel_filter_hz, imu.rate_hz)
+    return stepped(gyro, imu.gyro_resolution), stepped(accel, imu.accel_resolution), gyro_bias, accel_bias
+
+
+def filtered(values: Array, cutoff_hz: float, rate_hz: float) -> Array:
+    """Values (N, 3), `rate_hz` of them a second, behind a Butterworth filter of the second order, as ArduPilot's
+    LowPassFilter2p and PX4's LowPassFilter2p are; it begins settled. 0: not at all.
+
+    y'' + sqrt(2) w y' + w^2 y = w^2 u with w = 2 pi cutoff, exact for a u that is linear between samples. So slow motion
+    is late by sqrt(2) / w: 56 ms at 4 Hz.
+    """
+    if cutoff_hz == 0:
+        return values
+    w = 2 * np.pi * cutoff_hz
+    system = np.array([[0, 1, 0, 0], [-w * w, -np.sqrt(2) * w, w * w, 0], [0, 0, 0, 1], [0, 0, 0, 0]]) / rate_hz
+    step = np.linalg.matrix_power(_exponential(system / 1024), 1024)[:2]  # of y, y', u, u' in units of a second
+    rows, u = np.empty_like(values), values
+    change = np.diff(u, axis=0) * rate_hz
+    y, speed = u[0], np.zeros(3)
+    rows[0] = y
+    for k in range(1, len(u)):
+        y, speed = step @ np.array([y, speed, u[k - 1], change[k - 1]])
+        rows[k] = y
+    return rows
+
+
+def _exponential(small: Array) -> Array:
+    """The exponential of a matrix that is small, by its series."""
+    total, term = np.eye(len(small)), np.eye(len(small))
+    for k in range(1, 8):
+        term = term @ small / k
+        total = total + term
+    return total
 
 
 def stepped(values: Array, step: float) -> Array:

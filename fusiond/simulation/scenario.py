@@ -91,7 +91,7 @@ class Host(Section, frozen=True, kw_only=True):
 
 
 class Imu(Section, frozen=True, kw_only=True):
-    """[imu]: HIGHRES_IMU; each sample is measured at its stamp."""
+    """[imu]: HIGHRES_IMU; each sample is measured at its stamp, and then filtered as an autopilot filters it."""
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 100.0  # samples a second
     position_m: Vector = (1.2, 0.0, -0.6)  # where it sits
@@ -110,6 +110,8 @@ class Imu(Section, frozen=True, kw_only=True):
     vibration_mps2: NotNegative = 0.0  # amplitude of each band at 10 m/s, grows with speed
     vibration_deg_s: NotNegative = 0.0  # the same on the gyro
     vibration_width_hz: NotNegative = 1.0  # width of a band
+    gyro_filter_hz: NotNegative = 0.0  # cutoff of the autopilot's low-pass filter (ArduPilot: INS_GYRO_FILTER); 0: none
+    accel_filter_hz: NotNegative = 0.0  # the same of the accelerometer (INS_ACCEL_FILTER)
     silent_s: list[Interval] = field(default_factory=list)  # no samples
     transport: Transport = field(default_factory=Transport)
 

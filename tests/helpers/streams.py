@@ -201,8 +201,8 @@ def running_state(
     x[VELOCITY_E] = rng.normal(0.0, 10.0, 3)
     x[QUATERNION_EB] = quaternion(matrix_from_euler(*(float(a) for a in rng.uniform(-1.5, 1.5, 3))))
     root = rng.normal(0.0, 1.0, (state.size, state.size)) + 2 * np.eye(state.size)
-    sigmas, widths = [1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1]
-    scale = np.repeat(sigmas, widths)[:size]
+    sigmas = [1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0, 0.05, 0.01]
+    scale = np.repeat(sigmas, [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1])[:size]
     covariance = scale[:, None] * (root @ root.T) * scale / size
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)

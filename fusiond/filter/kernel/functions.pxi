@@ -841,6 +841,56 @@ cdef bint hot_start_leads(State* state, Parameters* params) noexcept nogil:
 cdef bint hot_start_has_state(State* state, Parameters* params) noexcept nogil:
     return ((state.stamps[10] == 2) or hot_start_leads(state, params))
 
+# ---------------- fusiond.filter.inertial_delay
+
+cdef void inertial_delay_catch_up(State* state, double* force_change, double* rate_change) noexcept nogil:
+    cdef double* x
+    cdef double* p
+    cdef int64_t gyro
+    cdef int64_t accel
+    cdef double c[3 * 3]
+    cdef double turned_e[3]
+    cdef double pushed_e[3]
+    cdef double turn[4]
+    cdef double _t1
+    cdef double _t2[3]
+    cdef int _i
+    cdef double _t3[4]
+    cdef double _t4[4]
+    cdef double _t5
+    cdef int64_t i
+    cdef double _t6
+    cdef double _t7
+    x = state.nominal
+    p = state.covariance
+    gyro, accel = 30, (30 + 1)
+    if ((n == 21) or (not ((p[(gyro) * n + gyro] + p[(accel) * n + accel]) > 0))):
+        return
+    rotation_matrix(x + 6, c)
+    rotation_times(c, rate_change, turned_e)
+    rotation_times(c, force_change, pushed_e)
+    _t1 = x[31]
+    for _i in range(3):
+        _t2[_i] = (rate_change[_i] * _t1)
+    rotation_quaternion_exp(_t2, turn)
+    rotation_quaternion_multiply(x + 6, turn, _t4)
+    rotation_normalised(_t4, _t3)
+    for _i in range(4):
+        (x + 6)[_i] = _t3[_i]
+    _t5 = x[(31 + 1)]
+    for _i in range(3):
+        (x + 3)[_i] += (pushed_e[_i] * _t5)
+    for i in range(3):
+        axpy(p + ((3 + i)) * n, pushed_e[i], p + (accel) * n)
+        axpy(p + ((6 + i)) * n, turned_e[i], p + (gyro) * n)
+    for i in range(3):
+        _t6 = pushed_e[i]
+        for _i in range(n):
+            (p + (3 + i))[_i * n] += (_t6 * (p + accel)[_i * n])
+        _t7 = turned_e[i]
+        for _i in range(n):
+            (p + (6 + i))[_i * n] += (_t7 * (p + gyro)[_i * n])
+
 # ---------------- fusiond.filter.inertial_sample
 
 cdef (double, double, double, double) inertial_sample_compare(State* state, double* values, double elapsed, Parameters* params) noexcept nogil:
@@ -1267,7 +1317,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         _t1 = 2
         m = _t1
         seen.m = _t1
-    elif ((state.nominal[31] > 0.05) and source_health_is_used(memory, True)):
+    elif ((state.nominal[34] > 0.05) and source_health_is_used(memory, True)):
         for a in range(m):
             seen.variance[a] = learnt[a]
         rivals_fit_lie(state, &seen, across, spread)
@@ -2493,9 +2543,24 @@ cdef void non_holonomic__observe(State* state, double* parameter, Observation* s
             (seen.jacobian + (i) * n)[_i] = (by + ((1 + i)) * n)[_i]
         seen.innovation[i] = (-velocity_v[(1 + i)])
     seen.variance[0], seen.variance[1] = parameter[3], parameter[4]
+    if ((n > 21) and (state.covariance[(32) * n + 32] > 0)):
+        non_holonomic__slide(state, velocity_v[0], by, seen)
     for _i in range(3):
         out[_i] = velocity_v[_i]
     return
+
+cdef void non_holonomic__slide(State* state, double speed, double* by, Observation* seen) noexcept nogil:
+    cdef double _t1[3]
+    cdef double turn
+    cdef double slip
+    cdef double along
+    model_rate_b(state, _t1)
+    turn, slip = _t1[2], state.nominal[33]
+    along = (fabs(speed) * speed)
+    seen.innovation[0] -= ((slip * along) * turn)
+    axpy(seen.jacobian + (0) * n, (((2 * slip) * fabs(speed)) * turn), by + (0) * n)
+    seen.jacobian[(0) * n + (9 + 2)] -= (slip * along)
+    seen.jacobian[(0) * n + 32] = (along * turn)
 
 # ---------------- fusiond.filter.observations.wheel_speed
 
@@ -2677,7 +2742,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
         rival = hypothesis_of(state, 0)
-        rival.nominal[31] = 1.0
+        rival.nominal[34] = 1.0
         for k in range(3, 15):
             rival.covariance[(k) * n + k] += (0.1 * rivals_lie_variance(k))
     if (state.bank[(3) * BLOCK + 0] == 0):
@@ -2710,7 +2775,7 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
     memset(lie, 0, n * sizeof(double))
     memset(off, 0, 3 * sizeof(double))
     rivals_with_lie(seen, spread, 100.0, widened)
-    if ((not (rival.nominal[31] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
+    if ((not (rival.nominal[34] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
         return 1.0
     for a in range(m):
         solved[a] = seen.innovation[a]
@@ -2894,7 +2959,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     for slot in range(4):
         state.bank[(slot) * BLOCK + 0] = (state.bank[(slot) * BLOCK + 0] / total)
     inertial = hypothesis_of(state, 0)
-    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[31] > 0.05))
+    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[34] > 0.05))
     excluded = (state.memory[((<int64_t>(state.stamps[23]))) * MEMORY_SIZE + 18] != 0)
     for slot in range(4):
         if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 if (young or (excluded and (slot == 0))) else (0.01 / 10))):
@@ -3429,6 +3494,9 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
     cdef double rate_change[3]
     cdef double force_b[3]
     cdef double rate_b[3]
+    cdef double share
+    cdef double _t3[3]
+    cdef double _t4[3]
     stamps = state.stamps
     a = state.auxiliary
     begin, held = (<int64_t>(stamps[0])), (<int64_t>(stamps[1]))
@@ -3468,6 +3536,13 @@ cdef void step_advance(State* state, int64_t t_ns, Row* imu, Parameters* params)
         (a + 9)[_i] = ((a + 3)[_i] + (end * rate_change[_i]))
     a[36] = ((params.noise.gyro / (span * 1e-09)) * (((1 - end) * (1 - end)) + (end * end)))
     strapdown_propagate(state, dt, force_b, rate_b, &params.noise)
+    if believed:
+        share = ((<double>((t_ns - begin))) / span)
+        for _i in range(3):
+            _t3[_i] = (share * force_change[_i])
+        for _i in range(3):
+            _t4[_i] = (share * rate_change[_i])
+        inertial_delay_catch_up(state, _t3, _t4)
     if (accel > 0):
         strapdown_add_white_noise(state.covariance, dt, accel, gyro)
         a[36] += (gyro / (span * 1e-09))
@@ -3735,12 +3810,12 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     for _i in range(4):
         (x + 6)[_i] = _t12[_i]
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
-    doubt = x[31]
+    doubt = x[34]
     strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 0.01)), (noise.gyro + (doubt * 0.0001)), noise)
     if (doubt > 0):
         for i in range(3):
             state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.0001) * dt)
-        x[31] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
+        x[34] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
 
 cdef void strapdown_gravity_gradient(double* position_e, double* out) noexcept nogil:
     cdef double r2

@@ -8,10 +8,10 @@ import math
 import numpy as np
 
 from fusiond.config.schema import Motion
-from fusiond.filter.observations.model import LEVER_ARM_B, Observation, empty_row, point_velocity_v
-from fusiond.filter.state import FilterState
+from fusiond.filter.observations.model import LEVER_ARM_B, Observation, empty_row, point_velocity_v, rate_b
+from fusiond.filter.state import ERROR_SIZE, GYRO_BIAS, SLIP, SLIP_ERROR, FilterState
 from fusiond.maths.portable import square
-from fusiond.maths.typed import Array, Vector, Vector3, compiled
+from fusiond.maths.typed import Array, ErrorRows3, Vector, Vector3, compiled
 
 LATERAL_VARIANCE, VERTICAL_VARIANCE = 3, 4  # (m/s)^2, parameters
 MIN_SPEED = 5  # m/s, parameters
@@ -50,4 +50,18 @@ def _observe(state: FilterState, parameter: Vector, seen: Observation) -> Vector
         seen.jacobian[i] = by[1 + i]
         seen.innovation[i] = -velocity_v[1 + i]
     seen.variance[0], seen.variance[1] = parameter[LATERAL_VARIANCE], parameter[VERTICAL_VARIANCE]
+    if state.size > ERROR_SIZE and state.covariance[SLIP_ERROR.start, SLIP_ERROR.start] > 0:
+        _slide(state, velocity_v[0], by, seen)
     return velocity_v
+
+
+@compiled
+def _slide(state: FilterState, speed: float, by: ErrorRows3, seen: Observation) -> None:
+    """Let tyres slide out of the bend: by an angle in proportion to the lateral acceleration, which is the speed [m/s] times
+    the turn rate. To the filter a gyro that is late looks alike, but for how it depends on the speed."""
+    turn, slip = rate_b(state)[2], state.nominal[SLIP.start]
+    along = abs(speed) * speed
+    seen.innovation[0] -= slip * along * turn
+    seen.jacobian[0] += (2 * slip * abs(speed) * turn) * by[0]
+    seen.jacobian[0, GYRO_BIAS.start + 2] -= slip * along
+    seen.jacobian[0, SLIP_ERROR.start] = along * turn

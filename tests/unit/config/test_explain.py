@@ -105,6 +105,22 @@ def test_probable_mistakes(folder: Path, old: str, new: str, oddity: str) -> Non
     assert found.startswith(oddity)
 
 
+def test_the_delay_of_an_ardupilot(folder: Path) -> None:
+    """Nobody who sends the state to an ArduPilot should miss what its filters do; one who says something of it knows."""
+    told = TEXT + '[autopilot]\nlink = "fc"\n'
+    imu = '[imu.imu0]\nlink = "fc"\n'
+    silent = told.replace(f"{imu}delay_ms = 4.0", imu)
+    (found,) = oddities(read(folder, silent))
+    assert found.startswith("imu.imu0: ArduPilot's low-pass filters delay")
+    for good in (told, f'{silent}kind = "px4"\n', silent.replace(imu, f"{imu}delay_sigma_ms = 50.0\n")):
+        assert list(oddities(read(folder, good))) == []
+
+
+def test_a_learnt_delay_is_described(folder: Path) -> None:
+    learnt = TEXT.replace("delay_ms = 4.0\n[gnss", "delay_ms = 4.0\ndelay_sigma_ms = 50.0\n[gnss")
+    assert "IMU          imu0: HIGHRES_IMU of fc, delay 4 ms +- 50 ms, learnt" in description(read(folder, learnt))
+
+
 def test_a_stream_that_is_turned_off_is_not_odd(folder: Path) -> None:
     off = TEXT.replace("velocity_delay_ms = 70.0", "velocity_delay_ms = 1500.0\nuse_velocity = false")
     assert list(oddities(read(folder, off))) == []

@@ -10,7 +10,18 @@ import pytest
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, IMU, MODEL, WHEEL_SPEED, wheel_speed
 from fusiond.filter.observations.model import CLUTTER, COMPANION, CORRELATION, NOISE_MAX, NOISE_MIN, RESETS, SHARED
 from fusiond.filter.parameters import make_parameters
-from fusiond.filter.state import ERROR_SIZE, FURTHER_SCALES_ERROR, HEIGHT_OFFSET_ERROR, POSITION, SCALE, VELOCITY, WIDE_SIZE
+from fusiond.filter.state import (
+    CALIBRATIONS,
+    ERROR_SIZE,
+    FURTHER_SCALES_ERROR,
+    HEIGHT_OFFSET_ERROR,
+    INERTIAL_DELAYS_ERROR,
+    POSITION,
+    SCALE,
+    SLIP_ERROR,
+    VELOCITY,
+    WIDE_SIZE,
+)
 from tests.helpers.streams import config
 
 PARAMS = make_parameters(
@@ -88,3 +99,13 @@ def test_gates_are_of_chi_square() -> None:
     assert PARAMS.gates[0] == math.inf
     np.testing.assert_allclose(PARAMS.gates[1:], [10.828, 13.816, 16.266], atol=1e-3)
     assert make_parameters(config(filter={"gate_probability": 0.95})).gates[3] == pytest.approx(7.815, abs=1e-3)
+
+
+def test_the_slip_is_learnt_where_the_delay_of_the_inertial_sensor_is() -> None:
+    for sigma_ms, holds, learnt in ((0.0, True, 0.0), (50.0, True, math.radians(0.5)), (50.0, False, 0.0)):
+        params = make_parameters(config(imu={"delay_sigma_ms": sigma_ms}, motion={"non_holonomic": holds}))
+        assert params.size == (WIDE_SIZE if sigma_ms else ERROR_SIZE)
+        sigmas = np.zeros(WIDE_SIZE)
+        sigmas[CALIBRATIONS : params.size] = np.sqrt(params.calibration_variances)
+        assert sigmas[INERTIAL_DELAYS_ERROR] == pytest.approx([sigma_ms * 1e-3] * 2)
+        assert sigmas[SLIP_ERROR] == pytest.approx([learnt])

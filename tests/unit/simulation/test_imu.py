@@ -10,6 +10,7 @@ import pytest
 from fusiond.maths import wgs84 as earth
 from fusiond.maths.rotation import matrix, quaternion_exp
 from fusiond.simulation.drive import simulate
+from fusiond.simulation.imu import filtered
 from tests.helpers.simulated import CRUISE, REST, ecef, scenario
 
 
@@ -43,6 +44,18 @@ def test_noiseless_imu_integrates_back_to_the_truth(start: str) -> None:
     mat_ne = earth.mat_ne(place[-1])
     assert mat_ne @ velocity == pytest.approx(truth.velocity_n[-1], abs=1e-3)
     assert mat_ne @ mat_eb == pytest.approx(matrix(truth.quaternion_nb[-1]), abs=1e-5)
+
+
+def test_filters_delay_slow_motion_and_damp_fast() -> None:
+    """A Butterworth filter of the second order: sqrt(2) / w late, and half the power left at its cutoff."""
+    t = np.arange(0.0, 10.0, 0.01)
+    ramp = np.outer(t, [1.0, -2.0, 0.5])
+    late = filtered(ramp, 4.0, 100.0)
+    delay = math.sqrt(2) / (2 * math.pi * 4.0)
+    assert late[500:] == pytest.approx(ramp[500:] - delay * np.array([1.0, -2.0, 0.5]), abs=1e-9)
+    shaken = filtered(np.sin(2 * math.pi * 2.0 * t)[:, None] * np.ones(3), 2.0, 100.0)[500:]
+    assert np.sqrt(2 * (shaken**2).mean(axis=0)) == pytest.approx(math.sqrt(0.5), rel=0.01)
+    assert filtered(ramp, 0.0, 100.0) is ramp
 
 
 # noise

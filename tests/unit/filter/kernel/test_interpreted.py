@@ -283,7 +283,7 @@ def test_sizes() -> None:
     """A kernel is compiled for a number of error states, and takes no state of other sizes."""
     from fusiond.filter.kernel import narrow, wide  # noqa: PLC0415 - only where they were built
 
-    with pytest.raises(ValueError, match="21 error states, not 30"):
+    with pytest.raises(ValueError, match=f"21 error states, not {WIDE_SIZE}"):
         narrow.Kernel(make_parameters(config(gnss=LEARNT)))
     with pytest.raises(ValueError, match="30 error states, not 21"):
         wide.Kernel(make_parameters(config()))

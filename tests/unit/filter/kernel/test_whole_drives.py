@@ -21,9 +21,11 @@ from fusiond.filter.state import (
     DELAYS_ERROR,
     EXCLUDED,
     HEIGHT_OFFSET_ERROR,
+    INERTIAL_DELAYS_ERROR,
     NEVER,
     PHASE,
     RUNNING,
+    SLIP_ERROR,
     T_START,
     T_STILL,
     VELOCITY_E,
@@ -170,12 +172,15 @@ def test_all_that_can_be_learnt() -> None:
         gnss=gnss | {"group": "roof", "shared_sigma_m": 0.5},
         wheel={"unsigned": False, "steered": True, "position_m": (1.2, 0.8, 0.3), "correlation_s": 0.2},
         barometer={"baro": {"link": "link", "sigma_m": 0.5}},
+        imu={"delay_sigma_ms": 50.0},
     )
     fusion = both_kernels(settings, sorted(events + pressure + yaws, key=lambda event: event.key))
     sigma = np.sqrt(np.diag(fusion.history.head.covariance))
     assert fusion.params.size == WIDE_SIZE
     assert sigma[HEIGHT_OFFSET_ERROR][0] < 3.0  # of 100 m
     assert sigma[DELAYS_ERROR][0] < 0.1
+    assert (sigma[INERTIAL_DELAYS_ERROR] < 0.05).all()
+    assert sigma[SLIP_ERROR][0] < math.radians(0.5)
     assert fusion.outcomes()["front_left"]["FUSED"] > 40
     assert fusion.outcomes()["yaw0"]["FUSED"] > 10
 

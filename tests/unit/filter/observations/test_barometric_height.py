@@ -19,6 +19,7 @@ from fusiond.filter.observations import barometric_height
 from fusiond.filter.observations.model import PARAMETERS, Unusable
 from fusiond.filter.rows import Outcome
 from fusiond.filter.state import (
+    CALIBRATIONS,
     CHOOSING,
     HEIGHT_OFFSET,
     HEIGHT_OFFSET_ERROR,
@@ -203,4 +204,4 @@ def test_shuffled_arrivals_give_the_same_bits(compiled: bool) -> None:
 def test_a_barometer_widens_the_state() -> None:
     fusion = Fusion(settings(), compiled_available())
     assert fusion.params.size == WIDE_SIZE
-    assert fusion.params.calibration_variances[-1] == 100.0 * 100.0
+    assert fusion.params.calibration_variances[HEIGHT_OFFSET_ERROR.start - CALIBRATIONS] == 100.0 * 100.0

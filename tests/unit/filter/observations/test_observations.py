@@ -34,6 +34,8 @@ from fusiond.filter.state import (
     POSITION_E,
     QUATERNION_EB,
     RATE_B,
+    SLIP,
+    SLIP_ERROR,
     SMOOTH_FORCE_B,
     VELOCITY_E,
     WHEEL_SCALE,
@@ -50,7 +52,8 @@ GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
 WHITE = msgspec.structs.replace(GNSS, position_correlation_s=0.0)
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
-STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0], [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1])
+WIDTHS = [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1]
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0, 0.01, 0.01], WIDTHS)
 BAROMETER = Barometer(link="l")
 ANTENNAS = DualAntenna(link="l", offset_deg=50.0)
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
@@ -118,6 +121,7 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     """A state that moves forward along its own axis, with a little of everything else."""
     state = running_state(rng, size=WIDE_SIZE)
     slip = 0.1 if abs(speed) > 1 else 0.01
+    state.nominal[SLIP] = 0.02
     state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
     state.auxiliary[SMOOTH_FORCE_B] = rng.normal((0.0, 0.0, -9.8), 0.5)
     state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
@@ -292,6 +296,20 @@ def test_non_holonomic_takes_the_mount_out() -> None:
     state.nominal[VELOCITY_E] = mat_eb(state) @ (matrix_from_euler(0.0, pitch, yaw).T @ [12.0, 0.0, 0.0])
     seen = found(non_holonomic.observe, state, parameters, parameters)
     np.testing.assert_allclose(seen.innovation, 0.0, atol=1e-12)
+
+
+def test_non_holonomic_lets_tyres_slide_out_of_a_bend() -> None:
+    """In a bend to the right the axle moves to the left, by the slip times lateral acceleration and speed."""
+    state, parameters = FilterState(7, WIDE_SIZE), non_holonomic.parameters(Motion())
+    level = level_state()
+    state.nominal[QUATERNION_EB], state.nominal[POSITION_E] = level.nominal[QUATERNION_EB], level.nominal[POSITION_E]
+    state.nominal[SLIP], state.auxiliary[RATE_B] = 0.01, (0.0, 0.0, 0.2)
+    state.nominal[VELOCITY_E] = mat_eb(state) @ (10.0, -0.01 * 0.2 * 10.0**2, 0.0)
+    unaware = found(non_holonomic.observe, state, parameters, parameters)
+    state.covariance[SLIP_ERROR, SLIP_ERROR] = 1e-4
+    seen = found(non_holonomic.observe, state, parameters, parameters)
+    assert unaware.innovation == pytest.approx([0.2, 0.0], abs=1e-9)
+    assert seen.innovation == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_zero_rotation_allows_for_the_earth() -> None:
