@@ -31,7 +31,7 @@ def test_every_input_and_output_can_be_made(module: str) -> None:
         pytest.skip(str(missing))
 
 
-@pytest.mark.parametrize("reader", {kind.reader for kind in LOG_FORMATS})
+@pytest.mark.parametrize("reader", sorted({kind.reader for kind in LOG_FORMATS}))
 def test_every_log_format_has_a_reader(reader: str) -> None:
     assert callable(import_module(f"fusiond_adapters.{reader}").open_log)
 

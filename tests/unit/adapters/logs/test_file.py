@@ -45,7 +45,7 @@ def test_a_zipped_log_cut_off_keeps_what_came_before(tlog: Path) -> None:
         *((f"a.{kind}", CANDUMP.encode()) for kind in ("asc", "blf", "trc", "csv", "db", "mf4")),
         *((f"a.{kind}", random.Random(6).randbytes(5000)) for kind in ("asc", "blf", "trc", "csv", "db")),
         *((f"a.{kind}.gz", CANDUMP.encode()) for kind in ("tlog", "log", "asc", "blf")),
-        *((f"a.{kind}.gz", gzip.compress(b"")) for kind in ("tlog", "log", "asc", "blf", "trc", "csv")),
+        *((f"a.{kind}.gz", gzip.compress(b"", mtime=0)) for kind in ("tlog", "log", "asc", "blf", "trc", "csv")),
     ],
 )
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
