@@ -76,7 +76,7 @@ uninstall:
 LOCK := uv pip compile --quiet --upgrade --generate-hashes --universal --python-version 3.11 --no-header --no-annotate
 
 lock:
-	$(LOCK) --no-emit-package lxml pyproject.toml --output-file packaging/requirements.txt
+	$(LOCK) --no-emit-package lxml --extra prometheus pyproject.toml --output-file packaging/requirements.txt
 	$(LOCK) packaging/build.in --output-file packaging/build-requirements.txt
 
 $(READY): pyproject.toml setup.py $(wildcard fusiond/filter/kernel/*.px[ix])

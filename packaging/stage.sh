@@ -48,7 +48,7 @@ fi
 install -Dm644 -t "$root/usr/lib/systemd/system" systemd/fusiond.service systemd/fusiond@.service
 install -Dm644 systemd/fusiond.sysusers "$root/usr/lib/sysusers.d/fusiond.conf"
 install -Dm644 systemd/fusiond.tmpfiles "$root/usr/lib/tmpfiles.d/fusiond.conf"
-install -Dm644 -t "$root/usr/share/fusiond/examples" configs/*.toml configs/*.dbc configs/prometheus/* systemd/80-can0.network
+install -Dm644 -t "$root/usr/share/fusiond/examples" configs/*.toml configs/*.parm configs/*.params configs/*.dbc configs/prometheus/* systemd/80-can0.network
 install -Dm644 -t "$root/usr/share/fusiond/examples/zenoh" configs/zenoh/*
 install -dm755 "$root/usr/bin" "$root/usr/share/man/man1" "$root/usr/share/doc/fusiond"
 ln -sfn /opt/fusiond/bin/fusiond "$root/usr/bin/fusiond"
