@@ -18,10 +18,11 @@ LOCKS = {"requirements.txt": "dependencies", "build-requirements.txt": "requires
 
 
 def wanted(lock: str) -> list[str]:
-    """What pyproject.toml asks for."""
+    """What pyproject.toml asks for; the service has the library of its Prometheus output, too."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     section = project["project"] if lock == "requirements.txt" else project["build-system"]
-    return list(section[LOCKS[lock]])
+    outputs = project["project"]["optional-dependencies"]["prometheus"] if lock == "requirements.txt" else []
+    return [*section[LOCKS[lock]], *outputs]
 
 
 @pytest.mark.parametrize("lock", LOCKS)
@@ -33,6 +34,14 @@ def test_a_lock_names_everything_with_hashes_and_no_host(lock: str) -> None:
         name, _, least = requirement.partition(">=")
         found = versions[name.lower()]
         assert tuple(map(int, found.split("."))) >= tuple(map(int, least.split("."))), requirement
+
+
+def test_every_configuration_is_installed_with_the_files_that_it_names() -> None:
+    """The autopilot's parameters and the DBC file beside it."""
+    script = (PACKAGING / "stage.sh").read_text(encoding="utf-8")
+    patterns = re.findall(r"configs/\*\.\w+", script)
+    installed = {path.name for pattern in patterns for path in ROOT.glob(pattern)}
+    assert installed == {path.name for path in (ROOT / "configs").iterdir() if path.is_file()}
 
 
 def printed(script: str, *arguments: str) -> str:
