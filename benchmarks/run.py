@@ -28,7 +28,7 @@ from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.filter.kernel.interpreted import Kernel, make_kernel
-from fusiond.filter.rows import ROW
+from fusiond.filter.rows import ROW, Outcome
 from fusiond.filter.state import NEVER, T_LAST, FilterState, T
 from fusiond.simulation.scenario import parse
 from fusiond.units import MILLISECOND, SECOND
@@ -143,7 +143,7 @@ def one_row(kernel: Kernel, head: FilterState, fusion: Fusion, source: str) -> C
     table[0]["values"][: len(values)] = values
     kept = np.zeros((2, len(head.numbers))), np.zeros((2, len(head.whole)), dtype=np.int64), np.zeros(2, dtype=np.int64)
     kept[1][:] = head.whole
-    kernel.attach(head, table, np.zeros((len(fusion.params.sources), 6), dtype=np.int64), *kept)
+    kernel.attach(head, table, np.zeros((len(fusion.params.sources), len(Outcome)), dtype=np.int64), *kept)
     now = int(head.stamps[T])
 
     def run() -> None:

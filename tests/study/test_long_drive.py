@@ -14,7 +14,7 @@ from fusiond.config.schema import Config
 from fusiond.filter.kernel.interpreted import compiled_available, make_kernel
 from fusiond.filter.observations import IMU, MODEL
 from fusiond.filter.parameters import make_parameters
-from fusiond.filter.rows import ROW
+from fusiond.filter.rows import ROW, Outcome
 from fusiond.filter.state import BLOWN, POSITION_E, RESETS, VELOCITY_E, FilterState
 from fusiond.filter.step import run_one
 from fusiond.maths.wgs84 import ecef, mat_ne
@@ -121,7 +121,7 @@ def drive(rounds: int) -> tuple[FilterState, list[float]]:
     course, random = Course(), np.random.default_rng(SEED)
     settings = course.params
     kernel, head = make_kernel(settings), FilterState(len(settings.sources))
-    counts = np.zeros((len(settings.sources), 6), dtype=np.int64)
+    counts = np.zeros((len(settings.sources), len(Outcome)), dtype=np.int64)
     memory = np.zeros((4096, len(head.numbers))), np.zeros((4096, len(head.whole)), dtype=np.int64)
     nees = []
     for number in range(rounds):

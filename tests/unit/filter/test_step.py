@@ -12,7 +12,7 @@ from fusiond.estimator.fusion import Fusion
 from fusiond.events import Measurement, WheelSpeed
 from fusiond.filter.kernel.interpreted import make_kernel
 from fusiond.filter.parameters import make_parameters
-from fusiond.filter.rows import ROW
+from fusiond.filter.rows import ROW, Outcome
 from fusiond.filter.state import (
     ALIGNING,
     CHOOSING,
@@ -50,7 +50,7 @@ def test_an_event_goes_where_its_key_belongs(compiled: bool, seed: int) -> None:
     begin, end, kept = 3, 3, set[Key]()  # the live part need not begin with the table
     rows, head = table([], 80), FilterState(len(PARAMS.sources))
     rows["t_ns"] = T0 + 5
-    counts = np.zeros((len(PARAMS.sources), 6), np.int64)
+    counts = np.zeros((len(PARAMS.sources), len(Outcome)), np.int64)
     kernel.attach(head, rows, counts, head.numbers[None].copy(), head.whole[None].copy(), np.zeros(1, np.int64))
     for _ in range(70):
         t_ns, source, sequence = key = T0 + int(rng.integers(5)), int(rng.integers(4)), int(rng.integers(4))

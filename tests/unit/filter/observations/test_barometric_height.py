@@ -132,7 +132,9 @@ def test_the_offset_is_learnt_and_steadies_the_height() -> None:
     state = fusion.solution_at(fusion.history.applied_ns).state
     assert state is not None
     assert abs(state.height - MUNICH[2]) < 3 * math.sqrt(state.covariance[2, 2])
-    assert fusion.outcomes()["baro"]["FUSED"] >= 298
+    counts = fusion.outcomes()["baro"]
+    assert counts["FUSED"] + counts["GATHERED"] >= 298
+    assert counts["GATHERED"] <= 45  # until it pulls away and the heading is chosen
 
 
 def test_a_simulated_drive(tmp_path: Path) -> None:
@@ -146,7 +148,8 @@ def test_a_simulated_drive(tmp_path: Path) -> None:
     assert sigma < 2.0
     assert abs(offset - 80.0) < 3 * sigma
     counts = fusion.outcomes()["baro0"]
-    assert counts["FUSED"] >= 0.99 * sum(counts.values()) > 240
+    assert counts["FUSED"] + counts["GATHERED"] >= 0.99 * sum(counts.values()) > 240
+    assert counts["GATHERED"] <= 10  # the first second
 
 
 def test_an_offset_that_jumps_is_learnt_anew() -> None:
@@ -180,7 +183,9 @@ def test_both_kernels_alike() -> None:
     np.testing.assert_array_equal(bits(a.numbers), bits(b.numbers))
     np.testing.assert_array_equal(a.whole, b.whole)
     assert first.outcomes() == second.outcomes()
-    assert first.outcomes()["baro"][Outcome.FUSED.name] > 80
+    counts = first.outcomes()["baro"]
+    assert counts[Outcome.FUSED.name] > 40
+    assert counts[Outcome.FUSED.name] + counts[Outcome.GATHERED.name] > 80
 
 
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiled), False])
