@@ -225,7 +225,8 @@ def _judge(
     if not gnss and state.stamps[ALIVE] > 0:
         return
     if same and not source_health.is_trusted(memory):
-        return  # it goes on repeating itself: that it happens to be right, at rest say, proves nothing
+        source_health.judge_repeated(memory, whitened, m)
+        return
     wheel = model == WHEEL_SPEED and source_health.is_trusted(memory)
     if wheel and not carried(state, memory[LAST_SPEED], params) and rivals.wheels_contradict(state, params):
         rivals.suspect_motion(state, rivals.BEGIN)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fusiond.filter import rivals
 from fusiond.filter.measurement_update import project, update_projected
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
-from fusiond.filter.observations.model import Observation, mat_eb, with_rate_noise
+from fusiond.filter.observations.model import LEVER_ARM_B, Observation, mat_eb, with_rate_noise
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.source_health import is_stuck, is_trusted
 from fusiond.filter.state import (
@@ -16,6 +18,7 @@ from fusiond.filter.state import (
     CONSTRAINT_FUSED,
     CONSTRAINT_RATIO,
     CONSTRAINT_REJECTED,
+    DOUBTED_AT_REST,
     GYRO_BIAS_B,
     INTERVAL,
     LAST_SPEED,
@@ -107,22 +110,43 @@ def rests(state: FilterState, params: Parameters) -> bool:
 
 
 @compiled
+def turn_shown(state: FilterState, params: Parameters) -> float:
+    """How fast [rad/s] a vehicle may turn by what its wheels read, while all of them rest: those at one side may creep
+    forward, the others backward."""
+    fastest, left, right = 0.0, math.inf, -math.inf
+    for i in params.wheels:
+        fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS
+        if fresh and is_trusted(state.memory[i]):
+            side = params.model_parameters[i, LEVER_ARM_B.start + 1]
+            fastest, left, right = max(fastest, abs(state.memory[i, LAST_SPEED])), min(left, side), max(right, side)
+    return 2 * fastest / (right - left) if right > left else 0.0
+
+
+@compiled
 def doubt_turn(state: FilterState, rate_b: Vector3, dt: float, params: Parameters) -> None:
     """Take one angular rate (3,) [rad/s], `dt` [s] long, as doubtful while all wheels rest and nothing says that the vehicle
-    is carried: it may turn on a plate, or the gyro lies. So its heading is then at least as uncertain as it has turned."""
+    is carried: it may turn on a plate, or the gyro lies. So as it turns, faster than a wheel that creeps shows, its heading
+    becomes as uncertain as it has turned, until a measurement tells it: a dual antenna, say."""
     if state.stamps[PHASE] != RUNNING or not rests(state, params) or carried(state, 0.0, params):
-        state.auxiliary[TURNED_AT_REST] = 0.0
+        state.auxiliary[TURNED_AT_REST] = state.auxiliary[DOUBTED_AT_REST] = 0.0
         return
     down_e = mat_ne(state.nominal[POSITION_E])[2]
     rate_e = times(mat_eb(state), rate_b - state.nominal[GYRO_BIAS_B])
     rate_e[2] -= EARTH_RATE
+    turning = 0.0
     for i in range(3):
-        state.auxiliary[TURNED_AT_REST] += down_e[i] * rate_e[i] * dt
+        turning += down_e[i] * rate_e[i]
+    unseen = max(abs(turning) - turn_shown(state, params), 0.0)
+    state.auxiliary[TURNED_AT_REST] += unseen * dt if turning > 0 else -unseen * dt
+    turned, doubted = abs(state.auxiliary[TURNED_AT_REST]), state.auxiliary[DOUBTED_AT_REST]
+    if turned <= doubted:
+        return
+    state.auxiliary[DOUBTED_AT_REST] = turned
     variance = 0.0
     for i in range(3):
         for j in range(3):
             variance += down_e[i] * state.covariance[ATTITUDE.start + i, ATTITUDE.start + j] * down_e[j]
-    missing = square(state.auxiliary[TURNED_AT_REST]) - variance
+    missing = min(square(turned) - variance, square(turned) - square(doubted))
     if missing > 0:
         for i in range(3):
             for j in range(3):

@@ -141,6 +141,18 @@ def judge(memory: Vector, stamps: Stamps, whitened: Vector3, m: int, same: bool,
 
 
 @compiled
+def judge_repeated(memory: Vector, whitened: Vector3, m: int) -> None:
+    """Whether a distrusted source that repeats its reading is rather frozen than biased. It stays distrusted: that it
+    happens to be right, at rest say, proves nothing."""
+    nominal, _noisy, biased, frozen = likelihoods(memory, whitened, m, True)
+    distrusted, share = memory[BIASED] + memory[FROZEN], frozen * memory[FROZEN]
+    total = biased * memory[BIASED] + share
+    if nominal <= frozen and total > 0:
+        memory[FROZEN] = distrusted * share / total
+        memory[BIASED] = distrusted - memory[FROZEN]
+
+
+@compiled
 def look(memory: Vector, whitened: Vector3, m: int, same: bool) -> None:
     """The probabilities after a look, from those before it. A reading that shares its error with the look before takes its
     place: what both say counts once."""

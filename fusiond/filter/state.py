@@ -83,6 +83,7 @@ SMOOTH_FORCE_B = _auxiliary.block(3)  # m/s^2, mean over the delays of receivers
 MAIN_WEIGHT = _auxiliary.one()  # weight of the main state against those of the rivals in the bank
 INERTIAL_ODDS = _auxiliary.one()  # that the inertial sensor lied a moment ago
 TURNED_AT_REST = _auxiliary.one()  # rad, about the vertical, by the gyro, since all wheels rest
+DOUBTED_AT_REST = _auxiliary.one()  # rad, the most of it so far: what the heading has been doubted by
 STATE_DOUBT = _auxiliary.one()  # probability that the position is wrong, since the inertial sensor lied
 CHANGE_FORCE = _auxiliary.one()  # (m/s^2)^2, mean square of the change from one inertial sample to the next
 CHANGE_RATE = _auxiliary.one()  # (rad/s)^2

@@ -912,9 +912,9 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
         force += portable_square((values[i] - a[(0 + i)]))
         rate += portable_square((values[(3 + i)] - a[(3 + i)]))
     white = (6.0 / (0.0001 if 0.0001 > elapsed else elapsed))
-    _t2 = a[44]
+    _t2 = a[45]
     _t3 = (white * params.noise.accel)
-    _t4 = a[45]
+    _t4 = a[46]
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
@@ -944,7 +944,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         return False
     since = inertial_sample_since_last(state, t_ns, params)
-    if (not (state.auxiliary[46] > since)):
+    if (not (state.auxiliary[47] > since)):
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -981,7 +981,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     t_ns = (<int64_t>row.t_ns)
     since = inertial_sample_since_last(state, t_ns, params)
     if (since == INFINITY):
-        a[46] = 0.0
+        a[47] = 0.0
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -1001,18 +1001,18 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
             else:
                 row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
                 row.variance[i] = (own_rate / 3)
-        if (a[46] > since):
-            a[46] -= since
+        if (a[47] > since):
+            a[47] -= since
             return False
-        a[46] = 0.0
+        a[47] = 0.0
     else:
-        _t3 = (a[46] + since)
-        a[46] = (2.0 if 2.0 < _t3 else _t3)
+        _t3 = (a[47] + since)
+        a[47] = (2.0 if 2.0 < _t3 else _t3)
     share = (since / (1.0 + since))
     _t4 = (16.0 * own_force)
-    a[44] += (share * ((_t4 if _t4 < force else force) - a[44]))
+    a[45] += (share * ((_t4 if _t4 < force else force) - a[45]))
     _t5 = (16.0 * own_rate)
-    a[45] += (share * ((_t5 if _t5 < rate else rate) - a[45]))
+    a[46] += (share * ((_t5 if _t5 < rate else rate) - a[46]))
     return True
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
@@ -1064,15 +1064,15 @@ cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_n
     a = state.auxiliary
     same, fine = inertial_sample_judge_axes(state, values, params), False
     for kind in range(2):
-        change = (a[44] if (kind == 0) else a[45])
-        if (change >= (3 * portable_square((4.0 * a[(53 + kind)])))):
+        change = (a[45] if (kind == 0) else a[46])
+        if (change >= (3 * portable_square((4.0 * a[(54 + kind)])))):
             fine = True
     if (fine or (not same)):
         source_health_judge_repetition(memory, state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE, same, t_ns)
     if (memory[20] > 0):
         odds = 0.0
         for i in range(6):
-            _t1 = state.auxiliary[(57 + i)]
+            _t1 = state.auxiliary[(58 + i)]
             odds = (_t1 if _t1 > odds else odds)
         source_health_blame_frozen(memory, (odds / (1 + odds)))
 
@@ -1115,22 +1115,22 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
             sensed = 0.0
             for j in range(3):
                 sensed += (turn[((0 + (3 * j)) + i)] * values[(first + j)])
-            moved[i] = fabs((sensed - a[((47 + first) + i)]))
-            a[((47 + first) + i)] = sensed
-            _t1 = a[(55 + kind)]
+            moved[i] = fabs((sensed - a[((48 + first) + i)]))
+            a[((48 + first) + i)] = sensed
+            _t1 = a[(56 + kind)]
             _t2 = fabs(sensed)
-            a[(55 + kind)] = (_t2 if _t2 > _t1 else _t1)
+            a[(56 + kind)] = (_t2 if _t2 > _t1 else _t1)
             if (moved[i] > 1e-09):
                 same = False
-                if ((a[(53 + kind)] == 0) or (moved[i] < a[(53 + kind)])):
-                    a[(53 + kind)] = moved[i]
-        least, lively = (4.0 * a[(53 + kind)]), 0
+                if ((a[(54 + kind)] == 0) or (moved[i] < a[(54 + kind)])):
+                    a[(54 + kind)] = moved[i]
+        least, lively = (4.0 * a[(54 + kind)]), 0
         for i in range(3):
             lively += (1 if (moved[i] > least) else 0)
         for i in range(3):
             k = (first + i)
             changed = (moved[i] > 1e-09)
-            _t3 = a[(57 + k)]
+            _t3 = a[(58 + k)]
             _t4 = 1e-06
             odds = (_t4 if _t4 > _t3 else _t3)
             if changed:
@@ -1139,16 +1139,16 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
                 odds = (_t6 if _t6 > _t5 else _t5)
             if ((lively - (1 if (moved[i] > least) else 0)) == 2):
                 if (not changed):
-                    _t7 = (1 - a[(63 + k)])
+                    _t7 = (1 - a[(64 + k)])
                     _t8 = (0.3333333333333333 if 0.3333333333333333 > _t7 else _t7)
                     chance = (0.95 if 0.95 < _t8 else _t8)
                     _t9 = (odds / chance)
                     odds = (1000.0 if 1000.0 < _t9 else _t9)
-                a[(63 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(63 + k)]))
-            a[(57 + k)] = odds
+                a[(64 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(64 + k)]))
+            a[(58 + k)] = odds
             if (odds > worst):
                 worst = odds
-                saturated = (fabs(a[(47 + k)]) >= a[(55 + kind)])
+                saturated = (fabs(a[(48 + k)]) >= a[(56 + kind)])
                 place = ((1.0 + k) + (6 if saturated else 0))
     memory[20] = place
     return same
@@ -1384,7 +1384,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
-            state.auxiliary[43] = 0.0
+            state.auxiliary[44] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     if ((model == 2) and (not fused)):
@@ -1418,6 +1418,7 @@ cdef void measurement__judge(State* state, int64_t source, double* whitened, int
     if ((not gnss) and (state.stamps[22] > 0)):
         return
     if (same and (not source_health_is_trusted(memory))):
+        source_health_judge_repeated(memory, whitened, m)
         return
     wheel = ((model == 2) and source_health_is_trusted(memory))
     if (wheel and (not motion_constraints_carried(state, memory[0], params)) and rivals_wheels_contradict(state, params)):
@@ -1960,34 +1961,73 @@ cdef bint motion_constraints_rests(State* state, Parameters* params) noexcept no
                 return False
     return heard
 
+cdef double motion_constraints_turn_shown(State* state, Parameters* params) noexcept nogil:
+    cdef double fastest
+    cdef double left
+    cdef double right
+    cdef int64_t i
+    cdef int64_t _k1
+    cdef bint fresh
+    cdef double side
+    cdef double _t2
+    fastest, left, right = 0.0, INFINITY, (-INFINITY)
+    for _k1 in range(params.wheels_count):
+        i = params.wheels[_k1]
+        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000)
+        if (fresh and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+            side = params.model_parameters[(i) * PARAMETERS + (0 + 1)]
+            _t2 = fabs(state.memory[(i) * MEMORY_SIZE + 0])
+            fastest, left, right = (_t2 if _t2 > fastest else fastest), (side if side < left else left), (side if side > right else right)
+    return (((2 * fastest) / (right - left)) if (right > left) else 0.0)
+
 cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt, Parameters* params) noexcept nogil:
-    cdef double _t1[3 * 3]
+    cdef double _t1
+    cdef double _t2[3 * 3]
     cdef double* down_e
     cdef double rate_e[3]
-    cdef double _t2[3 * 3]
-    cdef double _t3[3]
+    cdef double _t3[3 * 3]
+    cdef double _t4[3]
     cdef int _i
+    cdef double turning
     cdef int64_t i
+    cdef double _t5
+    cdef double unseen
+    cdef double turned
+    cdef double doubted
     cdef double variance
     cdef int64_t j
+    cdef double _t6
+    cdef double _t7
     cdef double missing
     if ((state.stamps[10] != 2) or (not motion_constraints_rests(state, params)) or motion_constraints_carried(state, 0.0, params)):
-        state.auxiliary[42] = 0.0
+        _t1 = 0.0
+        state.auxiliary[42] = _t1
+        state.auxiliary[43] = _t1
         return
-    wgs84_mat_ne(state.nominal, _t1)
-    down_e = _t1 + (2) * 3
-    model_mat_eb(state, _t2)
+    wgs84_mat_ne(state.nominal, _t2)
+    down_e = _t2 + (2) * 3
+    model_mat_eb(state, _t3)
     for _i in range(3):
-        _t3[_i] = (rate_b[_i] - (state.nominal + 10)[_i])
-    rotation_times(_t2, _t3, rate_e)
+        _t4[_i] = (rate_b[_i] - (state.nominal + 10)[_i])
+    rotation_times(_t3, _t4, rate_e)
     rate_e[2] -= 7.292115e-05
+    turning = 0.0
     for i in range(3):
-        state.auxiliary[42] += ((down_e[i] * rate_e[i]) * dt)
+        turning += (down_e[i] * rate_e[i])
+    _t5 = (fabs(turning) - motion_constraints_turn_shown(state, params))
+    unseen = (0.0 if 0.0 > _t5 else _t5)
+    state.auxiliary[42] += ((unseen * dt) if (turning > 0) else ((-unseen) * dt))
+    turned, doubted = fabs(state.auxiliary[42]), state.auxiliary[43]
+    if (turned <= doubted):
+        return
+    state.auxiliary[43] = turned
     variance = 0.0
     for i in range(3):
         for j in range(3):
             variance += ((down_e[i] * state.covariance[((6 + i)) * n + (6 + j)]) * down_e[j])
-    missing = (portable_square(state.auxiliary[42]) - variance)
+    _t6 = (portable_square(turned) - variance)
+    _t7 = (portable_square(turned) - portable_square(doubted))
+    missing = (_t7 if _t7 < _t6 else _t6)
     if (missing > 0):
         for i in range(3):
             for j in range(3):
@@ -2737,7 +2777,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     cdef State rival
     cdef int64_t k
     state.auxiliary[41] = 1e-06
-    if (state.auxiliary[69] != 0):
+    if (state.auxiliary[70] != 0):
         return
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
@@ -2830,7 +2870,7 @@ cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nog
     cdef State rival
     cdef int _i
     cdef int64_t k
-    if (state.auxiliary[69] != 0):
+    if (state.auxiliary[70] != 0):
         return
     if (state.stamps[22] == 0):
         state.auxiliary[40] = 1.0
@@ -2925,7 +2965,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[43] + portable_square((since / 200.0)))
+    _t1 = (state.auxiliary[44] + portable_square((since / 200.0)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
@@ -3001,7 +3041,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
         if (not ((slot == 1) and (other == 0))):
             rivals_close_slot(state, other)
     if (slot == 0):
-        state.auxiliary[43] = 0.5
+        state.auxiliary[44] = 0.5
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
@@ -3128,6 +3168,26 @@ cdef void source_health_judge(double* memory, int64_t* stamps, double* whitened,
         memory[(14 + i)] = (memory[(4 + i)] + (blurred * (usual - memory[(4 + i)])))
     source_health_look(memory, whitened, m, same)
     source_health__follow_bias(memory, whitened, m)
+
+cdef void source_health_judge_repeated(double* memory, double* whitened, int64_t m) noexcept nogil:
+    cdef (double, double, double, double) _t1
+    cdef double nominal
+    cdef double _noisy
+    cdef double biased
+    cdef double frozen
+    cdef double distrusted
+    cdef double share
+    cdef double total
+    _t1 = source_health_likelihoods(memory, whitened, m, True)
+    nominal = _t1[0]
+    _noisy = _t1[1]
+    biased = _t1[2]
+    frozen = _t1[3]
+    distrusted, share = (memory[6] + memory[7]), (frozen * memory[7])
+    total = ((biased * memory[6]) + share)
+    if ((nominal <= frozen) and (total > 0)):
+        memory[7] = ((distrusted * share) / total)
+        memory[6] = (distrusted - memory[7])
 
 cdef void source_health_look(double* memory, double* whitened, int64_t m, bint same) noexcept nogil:
     cdef (double, double, double, double) _t1
@@ -3462,7 +3522,7 @@ cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* par
     cdef State rival
     begin = (<int64_t>(state.stamps[0]))
     step_advance(state, t_ns, imu, params)
-    if ((state.stamps[22] > 0) and (state.auxiliary[69] != 0)):
+    if ((state.stamps[22] > 0) and (state.auxiliary[70] != 0)):
         rivals_close_all(state)
     if (state.stamps[22] > 0):
         for slot in range(4):
@@ -3676,7 +3736,7 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
         a[(0 + i)] = _t1
         a[(6 + i)] = _t1
         a[(3 + i)] = values[(3 + i)]
-        if (a[69] == 0.0):
+        if (a[70] == 0.0):
             a[(9 + i)] = values[(3 + i)]
 
 cdef void step_guard(State* state) noexcept nogil:
@@ -4111,17 +4171,17 @@ cdef void strapdown_begin_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[69] == 0.0):
-        a[69] = 1.0
+    if (a[70] == 0.0):
+        a[70] = 1.0
         for _i in range(3):
-            (a + 70)[_i] = (state.nominal + 10)[_i]
+            (a + 71)[_i] = (state.nominal + 10)[_i]
         for i in range(3):
             for j in range(3):
-                a[((73 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
+                a[((74 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
     for _i in range(3):
-        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 70)[_i])
+        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 71)[_i])
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 70)[_i]
+        (state.nominal + 10)[_i] = (a + 71)[_i]
     a[36] = (0.05 * 0.05)
 
 cdef void strapdown_end_coasting(State* state) noexcept nogil:
@@ -4134,11 +4194,11 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[69] == 0.0):
+    if (a[70] == 0.0):
         return
-    a[69] = 0.0
+    a[70] = 0.0
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 70)[_i]
+        (state.nominal + 10)[_i] = (a + 71)[_i]
     for i in range(3):
         for _i in range(n):
             (p + ((bias + i)) * n)[_i] = 0.0
@@ -4146,7 +4206,7 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
             (p + (bias + i))[_i * n] = 0.0
     for i in range(3):
         for j in range(3):
-            p[((bias + i)) * n + (bias + j)] = a[((73 + (3 * i)) + j)]
+            p[((bias + i)) * n + (bias + j)] = a[((74 + (3 * i)) + j)]
 
 cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double* x

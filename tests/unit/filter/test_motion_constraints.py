@@ -8,20 +8,29 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
+from fusiond.filter.motion_constraints import doubt_turn
+from fusiond.filter.observations.model import mat_eb
+from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import (
+    ATTITUDE,
     CONSTRAINT_FUSED,
     GYRO_BIAS,
     GYRO_BIAS_B,
+    LAST_SPEED,
     NEVER,
     POSITION_E,
+    T_LAST,
     T_STILL,
     VELOCITY_E,
+    T,
 )
+from fusiond.maths.wgs84 import EARTH_RATE, mat_ne
 from tests.conftest import needs_compiled
-from tests.helpers.streams import SECOND, T0, Drive, config, drive, fuse, measurements
+from tests.helpers.streams import SECOND, T0, WHEELS, Drive, config, drive, fuse, measurements, running_state
 
 BIAS = (0.004, -0.003, 0.005)  # rad/s
 FACING = {"heading_deg": math.degrees(0.4), "heading_sigma_deg": 1.0}
@@ -178,3 +187,35 @@ def test_wheels_do_not_tell_the_heading() -> None:
             assert state is not None
             sigmas.append(math.degrees(state.sigma_yaw()))
     assert all(later > 0.95 * earlier for earlier, later in itertools.pairwise(sigmas))  # but for the second order
+
+
+def doubted(speed: float, told_s: float = 2.0) -> float:
+    """Sigma of the heading [rad] after a turn at rest by 0.2 rad/s for 1 s and back, where the wheels at both sides, 1.6 m
+    apart, read `speed` [m/s], and a measurement tells the heading at `told_s`."""
+    sides = {name: {"position_m": (0.0, -0.8 if "left" in name else 0.8, 0.3)} for name in WHEELS}
+    whole = config()
+    whole = replace(whole, wheel={name: replace(whole.wheel[name], **sides[name]) for name in WHEELS})
+    params = make_parameters(whole)
+    state = running_state(np.random.default_rng(3))
+    down = mat_ne(state.nominal[POSITION_E])[2]
+    state.covariance[ATTITUDE, ATTITUDE] = 1e-6 * np.eye(3)
+    for i in params.wheels:
+        state.memory[i, LAST_SPEED], state.source_stamps[i, T_LAST] = speed, state.stamps[T]
+    level_b = mat_eb(state).T @ down
+    for k in range(200):
+        if k == round(told_s * 100):
+            state.covariance[ATTITUDE, ATTITUDE] = 1e-6 * np.eye(3)
+        earth_b = mat_eb(state).T @ [0.0, 0.0, EARTH_RATE]
+        rate = (0.2 if k < 100 else -0.2) * level_b
+        doubt_turn(state, state.nominal[GYRO_BIAS_B] + earth_b + rate, 0.01, params)
+    return math.sqrt(down @ state.covariance[ATTITUDE, ATTITUDE] @ down)
+
+
+def test_a_turn_at_rest_is_doubted() -> None:
+    """As far as the wheels do not show it, and until a measurement tells the heading."""
+    assert doubted(0.0) == pytest.approx(0.2, rel=1e-6)
+    assert doubted(0.04) == pytest.approx(0.15, rel=1e-6)  # 0.05 rad/s by the wheels
+    assert doubted(0.09) == pytest.approx(0.2 - 0.1125, rel=1e-6)
+    assert doubted(0.11) == pytest.approx(1e-3, rel=1e-6)  # they turn
+    assert doubted(0.0, 1.0) == pytest.approx(1e-3, rel=1e-6)
+    assert doubted(0.0, 0.5) == pytest.approx(math.sqrt(0.2**2 - 0.1**2 + 1e-6), rel=1e-6)

@@ -73,6 +73,22 @@ def test_bayes_by_hand() -> None:
     assert memory[NOMINAL] < 0.9
 
 
+def test_a_distrusted_source_that_repeats_itself_stays_distrusted() -> None:
+    """It is frozen rather than biased if it is wrong; that it is right proves nothing."""
+    memory, stamps = blank()
+    for k in range(20):
+        health.judge(memory, stamps, np.array([8.0, 0.0, 0.0]), 1, False, T0 + k * SECOND // 10)
+    assert memory[BIASED] > 0.9
+    before, distrusted = memory.copy(), memory[BIASED] + memory[FROZEN]
+    for _ in range(100):
+        health.judge_repeated(memory, np.array([0.1, 0.0, 0.0]), 1)
+    np.testing.assert_array_equal(memory, before)
+    for _ in range(20):
+        health.judge_repeated(memory, np.array([5.0, 0.0, 0.0]), 1)
+    assert memory[FROZEN] > 0.9
+    assert memory[BIASED] + memory[FROZEN] == pytest.approx(distrusted, abs=1e-15)
+
+
 def test_absence_by_hand() -> None:
     """After k missed readings the odds of absence are prior odds over (1 - P_D)^k; a miss changes nothing else."""
     memory, stamps = blank()
