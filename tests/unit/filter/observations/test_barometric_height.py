@@ -84,6 +84,12 @@ def offset_of(fusion: Fusion) -> tuple[float, float]:
     return calibrations(fusion.params, fusion.history.head)["height_offset_m"]
 
 
+def taken(fusion: Fusion, source: str) -> int:
+    """Readings that went into the state, or into the hypotheses before there was one."""
+    counts = fusion.outcomes()[source]
+    return counts[Outcome.FUSED.name] + counts[Outcome.GATHERED.name]
+
+
 def test_values_and_parameters() -> None:
     barometer = Barometer(link="l", sigma_m=2.0, correlation_s=3.0)
     altitude, variance = barometric_height.values(Pressure(pressure(1_000.0), 250.0), barometer)
@@ -132,7 +138,7 @@ def test_the_offset_is_learnt_and_steadies_the_height() -> None:
     state = fusion.solution_at(fusion.history.applied_ns).state
     assert state is not None
     assert abs(state.height - MUNICH[2]) < 3 * math.sqrt(state.covariance[2, 2])
-    assert fusion.outcomes()["baro"]["FUSED"] >= 298
+    assert taken(fusion, "baro") >= 298
 
 
 def test_a_simulated_drive(tmp_path: Path) -> None:
@@ -145,8 +151,7 @@ def test_a_simulated_drive(tmp_path: Path) -> None:
     offset, sigma = offset_of(fusion)
     assert sigma < 2.0
     assert abs(offset - 80.0) < 3 * sigma
-    counts = fusion.outcomes()["baro0"]
-    assert counts["FUSED"] >= 0.99 * sum(counts.values()) > 240
+    assert taken(fusion, "baro0") >= 0.99 * sum(fusion.outcomes()["baro0"].values()) > 240
 
 
 def test_an_offset_that_jumps_is_learnt_anew() -> None:
@@ -180,7 +185,7 @@ def test_both_kernels_alike() -> None:
     np.testing.assert_array_equal(bits(a.numbers), bits(b.numbers))
     np.testing.assert_array_equal(a.whole, b.whole)
     assert first.outcomes() == second.outcomes()
-    assert first.outcomes()["baro"][Outcome.FUSED.name] > 80
+    assert taken(first, "baro") > 80 and first.outcomes()["baro"][Outcome.FUSED.name] > 40
 
 
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiled), False])
