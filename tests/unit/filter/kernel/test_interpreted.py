@@ -285,7 +285,7 @@ def test_sizes() -> None:
 
     with pytest.raises(ValueError, match=f"21 error states, not {WIDE_SIZE}"):
         narrow.Kernel(make_parameters(config(gnss=LEARNT)))
-    with pytest.raises(ValueError, match="30 error states, not 21"):
+    with pytest.raises(ValueError, match=f"{WIDE_SIZE} error states, not 21"):
         wide.Kernel(make_parameters(config()))
     kernel = make_kernel(make_parameters(config()), True)
     with pytest.raises(ValueError, match="numbers"):
