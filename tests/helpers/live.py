@@ -143,12 +143,11 @@ class Running:
 
     def until(self, condition: Callable[[], bool]) -> None:
         """Wait until a condition holds; it is checked whenever a state is published, and ten times a second."""
-        for _ in range(int(DEADLINE * 10)):
-            with self._changed:
-                if condition():
-                    return
+        end = time.monotonic() + DEADLINE
+        with self._changed:
+            while not condition():
+                assert time.monotonic() < end, f"not reached: {self.daemon.status()}, {self.daemon.losses()}"
                 self._changed.wait(0.1)
-        raise AssertionError(f"not reached: {self.daemon.status()}, {self.daemon.losses()}")
 
     def call(self, action: Callable[[], None]) -> None:
         """Call a function in the daemon's loop."""

@@ -228,9 +228,10 @@ def explanation(summary: Summary) -> Iterator[str]:
 
 def _inputs(summary: Summary) -> Iterator[str]:
     for name, source in summary.sources.items():
-        others = source.events - source.fused
-        rest = f", {others} not" if others else ""
-        yield f"  {name:<16} {source.events:>6} measurements, {source.fused} fused{rest}"
+        others = source.events - source.fused - source.gathered
+        start = f", {source.gathered} taken to find the start" if source.gathered else ""
+        rest = f", {others} not used" if others else ""
+        yield f"  {name:<16} {source.events:>6} measurements, {source.fused} fused{start}{rest}"
 
 
 def _quality(truth: TruthReport) -> str:

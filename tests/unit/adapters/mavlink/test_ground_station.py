@@ -53,6 +53,13 @@ def peer() -> Iterator[UdpListener]:
     made.close()
 
 
+@pytest.fixture
+def vehicle() -> Iterator[UdpPeer]:
+    made = UdpPeer()
+    yield made
+    made.close()
+
+
 def event(text: str, severity: Severity = "warning") -> EventMessage:
     return EventMessage(vehicle="test", t_ns=0, kind="source_lost", severity=severity, subject="gps0", text=text)
 
@@ -209,11 +216,10 @@ def test_only_the_marker_has_the_position_of_a_vehicle(peer: UdpListener, tmp_pa
 # --- Its ways
 
 
-def test_over_the_link_of_an_input(tmp_path: Path) -> None:
-    peer = UdpPeer()
-    settings, link = link_to(peer, tmp_path, '[ground_station]\nlink = "fc"\nrate_hz = 25.0\n')
+def test_over_the_link_of_an_input(vehicle: UdpPeer, tmp_path: Path) -> None:
+    settings, link = link_to(vehicle, tmp_path, '[ground_station]\nlink = "fc"\nrate_hz = 25.0\n')
     station = GroundStation(settings, {"mavlink.fc": link}, CLOCK.now_ns)
-    endpoint = Endpoint(peer)
+    endpoint = Endpoint(vehicle)
     with serving(link, station):
         greeted(endpoint, link)
         for state in recent(4):
@@ -225,7 +231,6 @@ def test_over_the_link_of_an_input(tmp_path: Path) -> None:
     numbers = [m.get_seq() for m in endpoint.messages if m.get_srcComponent() == 191]
     assert numbers == [(numbers[0] + step) % 256 for step in range(len(numbers))]  # one counter, whoever speaks
     assert link.listeners == []
-    peer.close()
 
 
 def test_a_connection_that_goes_is_an_output_lost(tmp_path: Path) -> None:
@@ -255,11 +260,12 @@ def test_a_connection_that_goes_is_an_output_lost(tmp_path: Path) -> None:
 # --- All of it, in the daemon
 
 
-def test_the_daemon_feeds_autopilot_and_ground_station(peer: UdpListener, tmp_path: Path) -> None:
-    vehicle = UdpPeer()
+def test_the_daemon_feeds_autopilot_and_ground_station(vehicle: UdpPeer, peer: UdpListener, tmp_path: Path) -> None:
+    """At rest, with a given heading that nothing confirms."""
     settings = configuration(
         tmp_path, vehicle.connection,
-        f'[autopilot]\nlink = "fc"\nyaw_sigma_deg = 30.0\nposition_sigma_m = 50.0\nvelocity_sigma_mps = 50.0\n'
+        f'[autopilot]\nlink = "fc"\nunconfirmed_heading = true\n'
+        f'yaw_sigma_deg = 30.0\nposition_sigma_m = 50.0\nvelocity_sigma_mps = 50.0\n'
         f'[ground_station]\nconnection = "{peer.connection}"\nrate_hz = 50.0\n')  # fmt: skip
     autopilot, endpoint, station = Autopilot(), Endpoint(vehicle), from_station(peer)
 
@@ -281,4 +287,3 @@ def test_the_daemon_feeds_autopilot_and_ground_station(peer: UdpListener, tmp_pa
     state = by_time[place.time_usec].state
     assert state is not None and place.lat == round(state.lat_deg * 1e7)
     assert notes["sending"] == "yes" and notes["used"].startswith("unknown")
-    vehicle.close()

@@ -179,6 +179,9 @@ def test_demo_explains_a_summary_to_a_newcomer(replay: Run, folder: Path, tmp_pa
     for part in ("WHAT WENT IN", "HOW LATE IT CAME", "HOW GOOD THE RESULT IS", "WITHOUT GNSS", "From second 4 to 8"):
         assert part in text
     assert "nan" not in text
+    lines = re.findall(r"(\d+) measurements, (\d+) fused, (\d+) taken to find the start(?:, (\d+) not used)?", text)
+    assert len(lines) == 7
+    assert all(int(events) == sum(map(int, filter(None, parts))) for events, *parts in lines)
 
 
 @pytest.mark.slow
