@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fusiond.filter import gnss_error, rivals, source_health
-from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
+from fusiond.filter.measurement_update import cholesky, correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried, rests
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, gnss_position, observe, wheel_speed
 from fusiond.filter.observations.gnss_velocity import lowest_speed
@@ -134,7 +134,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     before = source_health.odds_of_bias(memory)
     if not doubtful:
         whitened, lasting = np.empty(3), correlation_of(model, values, parameter)
-        judged, wider = seen.innovation.copy(), np.empty((3, 3))
+        judged, wider, lower = seen.innovation.copy(), np.empty((3, 3)), np.empty((3, 3))
         for a in range(m):
             for b in range(m):
                 wider[a, b] = spread[a, b]
@@ -143,6 +143,10 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             gnss_error.with_whole_error(state, source, values, params, judged, wider)
         if whiten(wider, judged, learnt, m, whitened):
             _judge(state, source, whitened, m, same, t_ns, lasting, params)
+            if model == GNSS_POSITION and cholesky(wider, learnt, 1.0, m, lower):
+                rivals.weigh_consistency(state, source, whitened, lower)
+        if model == GNSS_VELOCITY:
+            rivals.lead_off(state, source, seen.innovation, elapsed, params)
         source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = source_health.is_used(memory, by_rivals)
     if model == WHEEL_SPEED and trusted:

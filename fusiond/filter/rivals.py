@@ -31,6 +31,8 @@ from fusiond.filter.state import (
     INERTIAL_DOUBT,
     INERTIAL_ODDS,
     LAST_RATIO,
+    LED_OFF,
+    LED_OFF_ODDS,
     MAIN_WEIGHT,
     POSITION,
     POSITION_E,
@@ -61,6 +63,7 @@ LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, or goes whe
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
 MIN_WEIGHT = 1e-100
+MAX_CONSISTENCY = 20.0  # largest exponent of the odds that a fix gives
 LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
 LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
 LIE_SPEED = 0.05  # m/s, by which the velocity may be off
@@ -221,6 +224,15 @@ def wheels_contradict(state: FilterState, params: Parameters) -> bool:
 
 
 @compiled
+def witnessed(state: FilterState, params: Parameters) -> bool:
+    """Whether a wheel that is trusted was heard lately: there is more than an inertial sensor against a receiver."""
+    for i in params.wheels:
+        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[i]):
+            return True
+    return False
+
+
+@compiled
 def open_slot(state: FilterState, slot: int, odds: float) -> None:
     """Begin a rival as a copy of the main state, with odds against that; but not while the state coasts."""
     if state.auxiliary[COASTING] != 0:
@@ -293,9 +305,37 @@ def suspect_receiver(state: FilterState, source: int, params: Parameters) -> boo
     if odds < BEGIN or state.bank[RECEIVER, 0] > 0 or state.memory[source, EXCLUDED] != 0 or suspect < 0:
         return False
     state.stamps[SUSPECT] = suspect
+    state.auxiliary[LED_OFF] = 0.0
+    state.auxiliary[LED_OFF_ODDS] = 1.0
     open_slot(state, RECEIVER, min(odds, MAX_ODDS))
     suspect_motion(state, min(odds, MAX_ODDS) / 10)
     return state.bank[RECEIVER, 0] > 0
+
+
+@compiled
+def lead_off(state: FilterState, source: int, innovation: Vector3, elapsed: float, params: Parameters) -> None:
+    """Add to where a suspected receiver's velocity leads, by its innovation (2,) [m/s] over `elapsed` [s]."""
+    if state.bank[RECEIVER, 0] > 0 and int(params.model_parameters[int(state.stamps[SUSPECT]), COMPANION]) == source:
+        for i in range(2):
+            state.auxiliary[LED_OFF.start + i] += innovation[i] * elapsed
+
+
+@compiled
+def weigh_consistency(state: FilterState, source: int, whitened: Vector3, lower: Matrix3) -> None:
+    """Weigh the rival in which a receiver lies by a fix, whose whole error is `whitened` (2,) by L = `lower`: its position
+    must go where its velocity leads. A fix that stays with the state meanwhile speaks for the receiver. Only the newest
+    counts: the errors of fixes are alike."""
+    if not state.bank[RECEIVER, 0] > 0 or state.stamps[SUSPECT] != source:
+        return
+    led = np.empty(2)
+    led[0] = state.auxiliary[LED_OFF.start] / lower[0, 0]
+    led[1] = (state.auxiliary[LED_OFF.start + 1] - lower[1, 0] * led[0]) / lower[1, 1]
+    gained = 0.0
+    for i in range(2):
+        gained += led[i] * (2 * whitened[i] - led[i]) / 2
+    odds = exp(max(min(gained, 0.0), -MAX_CONSISTENCY))
+    state.bank[RECEIVER, 0] *= odds / state.auxiliary[LED_OFF_ODDS]
+    state.auxiliary[LED_OFF_ODDS] = odds
 
 
 @compiled
@@ -335,9 +375,9 @@ def wrong(state: FilterState, carried: bool) -> float:
 @compiled
 def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
     """Give up rivals that have become unlikely, and let one lead where the expected loss is less so. While the wheels rest
-    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it while it may well be
-    the state that is wrong."""
-    blamed = not disputed and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
+    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it by the inertial sensor
+    alone, or while it may well be the state that is wrong."""
+    blamed = not disputed and witnessed(state, params) and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
     total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
