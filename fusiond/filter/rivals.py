@@ -304,6 +304,8 @@ def suspect_receiver(state: FilterState, source: int, params: Parameters) -> boo
     suspect = position_of(source, params)
     if odds < BEGIN or state.bank[RECEIVER, 0] > 0 or state.memory[source, EXCLUDED] != 0 or suspect < 0:
         return False
+    if not witnessed(state, params):
+        return False
     state.stamps[SUSPECT] = suspect
     state.auxiliary[LED_OFF] = 0.0
     state.auxiliary[LED_OFF_ODDS] = 1.0
@@ -375,9 +377,11 @@ def wrong(state: FilterState, carried: bool) -> float:
 @compiled
 def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
     """Give up rivals that have become unlikely, and let one lead where the expected loss is less so. While the wheels rest
-    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it by the inertial sensor
-    alone, or while it may well be the state that is wrong."""
-    blamed = not disputed and witnessed(state, params) and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
+    and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it while it may well be
+    the state that is wrong, or by the inertial sensor alone."""
+    if state.bank[RECEIVER, 0] > 0 and not witnessed(state, params):
+        close_slot(state, RECEIVER)
+    blamed = not disputed and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
     total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:

@@ -1547,16 +1547,21 @@ cdef void measurement__suspect_receiver(State* state, int64_t source, double* va
         gnss_error_forget_prior(&rival, source, values, params)
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
-    cdef double odds
     cdef double wrong
+    cdef double odds
     cdef State rival
-    odds = state.bank[(1) * BLOCK + 0]
-    if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[23] != source)):
+    if ((state.bank[(2) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0)):
         return
-    if (state.memory[(source) * MEMORY_SIZE + 18] != 0):
+    if (state.bank[(1) * BLOCK + 0] > 0):
+        if (state.stamps[23] != source):
+            return
+        wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
+        odds = (state.bank[(1) * BLOCK + 0] * ((wrong / (1 - wrong)) / 0.001))
+    elif rivals_witnessed(state, params):
         return
-    wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
-    odds *= ((wrong / (1 - wrong)) / 0.001)
+    else:
+        odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
+        state.stamps[23] = source
     if (odds < (0.01 * (1 + state.bank[(1) * BLOCK + 0]))):
         return
     rivals_open_slot(state, 2, odds)
@@ -2908,6 +2913,8 @@ cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* para
     suspect = rivals_position_of(source, params)
     if ((odds < 0.01) or (state.bank[(1) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
         return False
+    if (not rivals_witnessed(state, params)):
+        return False
     state.stamps[23] = suspect
     for _i in range(2):
         (state.auxiliary + 42)[_i] = 0.0
@@ -2989,7 +2996,9 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     cdef double apart
     cdef double blurred
     cdef int64_t i
-    blamed = ((not disputed) and rivals_witnessed(state, params) and ((10.0 * state.bank[(2) * BLOCK + 0]) <= state.bank[(1) * BLOCK + 0]))
+    if ((state.bank[(1) * BLOCK + 0] > 0) and (not rivals_witnessed(state, params))):
+        rivals_close_slot(state, 1)
+    blamed = ((not disputed) and ((10.0 * state.bank[(2) * BLOCK + 0]) <= state.bank[(1) * BLOCK + 0]))
     total = state.auxiliary[40]
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
