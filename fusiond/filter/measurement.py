@@ -350,7 +350,7 @@ def _suspect_receiver(state: FilterState, source: int, values: Vector, params: P
 @compiled
 def _suspect_state(state: FilterState, source: int, values: Vector, seen: Observation, params: Parameters) -> None:
     """Where a receiver that is called a liar may be right all the same, as likely as the state is wrong, begin the rival
-    that is where it says. Where only an inertial sensor contradicts it, it is the state that is called wrong."""
+    that is where it says. Where the receiver may not lie, it is the state that is called wrong."""
     if state.bank[rivals.RETURN, 0] > 0 or state.memory[source, EXCLUDED] != 0:
         return  # what an excluded one says was weighed when it was found to lie
     if state.bank[rivals.RECEIVER, 0] > 0:
@@ -358,10 +358,10 @@ def _suspect_state(state: FilterState, source: int, values: Vector, seen: Observ
             return
         wrong = rivals.wrong(state, is_carried(state, params))
         odds = state.bank[rivals.RECEIVER, 0] * (wrong / (1 - wrong) / source_health.PRIOR_BIASED)
-    elif rivals.witnessed(state, params):
+    elif rivals.may_lie(state, source, params):
         return
     else:
-        odds = source_health.odds_of_bias(state.memory[source])
+        odds = source_health.odds_of_bias(state.memory[source]) / 10
         state.stamps[SUSPECT] = source
     if odds < rivals.BEGIN * (1 + state.bank[rivals.RECEIVER, 0]):
         return

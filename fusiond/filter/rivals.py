@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from fusiond.events import FIX_FIXED
 from fusiond.filter.measurement_update import cholesky, difference, inject, project, whiten
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
@@ -27,6 +28,7 @@ from fusiond.filter.state import (
     ATTITUDE,
     COASTING,
     EXCLUDED,
+    FIX_TYPE,
     GYRO_BIAS,
     INERTIAL_DOUBT,
     INERTIAL_ODDS,
@@ -224,8 +226,11 @@ def wheels_contradict(state: FilterState, params: Parameters) -> bool:
 
 
 @compiled
-def witnessed(state: FilterState, params: Parameters) -> bool:
-    """Whether a wheel that is trusted was heard lately: there is more than an inertial sensor against a receiver."""
+def may_lie(state: FilterState, receiver: int, params: Parameters) -> bool:
+    """Whether a receiver, by its position source, may be called a liar. Not where its ambiguities are fixed, which fits only
+    true carrier phases, and just an inertial sensor contradicts it; any trusted wheel that was heard lately is a witness."""
+    if state.memory[receiver, FIX_TYPE] != FIX_FIXED:
+        return True
     for i in params.wheels:
         if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[i]):
             return True
@@ -299,12 +304,13 @@ def weigh_liar(state: FilterState, source: int, lie: float, params: Parameters) 
 @compiled
 def suspect_receiver(state: FilterState, source: int, params: Parameters) -> bool:
     """Begin a rival that does without a receiver, where its health (D1) says that it may be biased; and those in which the
-    state has become wrong. Returns whether it has begun."""
+    state has become wrong, which alone begin where it may not lie. Returns whether it has begun."""
     odds = odds_of_bias(state.memory[source])
     suspect = position_of(source, params)
     if odds < BEGIN or state.bank[RECEIVER, 0] > 0 or state.memory[source, EXCLUDED] != 0 or suspect < 0:
         return False
-    if not witnessed(state, params):
+    if not may_lie(state, suspect, params):
+        suspect_motion(state, min(odds, MAX_ODDS))
         return False
     state.stamps[SUSPECT] = suspect
     state.auxiliary[LED_OFF] = 0.0
@@ -375,11 +381,13 @@ def wrong(state: FilterState, carried: bool) -> float:
 
 
 @compiled
-def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
+def decide(  # noqa: PLR0912 - loops
+    state: FilterState, disputed: bool, params: Parameters
+) -> None:
     """Give up rivals that have become unlikely, and let one lead where the expected loss is less so. While the wheels rest
     and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it while it may well be
-    the state that is wrong, or by the inertial sensor alone."""
-    if state.bank[RECEIVER, 0] > 0 and not witnessed(state, params):
+    the state that is wrong."""
+    if state.bank[RECEIVER, 0] > 0 and not may_lie(state, int(state.stamps[SUSPECT]), params):
         close_slot(state, RECEIVER)
     blamed = not disputed and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
     total = state.auxiliary[MAIN_WEIGHT]

@@ -1557,10 +1557,10 @@ cdef void measurement__suspect_state(State* state, int64_t source, double* value
             return
         wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
         odds = (state.bank[(1) * BLOCK + 0] * ((wrong / (1 - wrong)) / 0.001))
-    elif rivals_witnessed(state, params):
+    elif rivals_may_lie(state, source, params):
         return
     else:
-        odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
+        odds = (source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE) / 10)
         state.stamps[23] = source
     if (odds < (0.01 * (1 + state.bank[(1) * BLOCK + 0]))):
         return
@@ -2834,9 +2834,11 @@ cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept no
                 against += 1
     return ((2 * against) > heard)
 
-cdef bint rivals_witnessed(State* state, Parameters* params) noexcept nogil:
+cdef bint rivals_may_lie(State* state, int64_t receiver, Parameters* params) noexcept nogil:
     cdef int64_t i
     cdef int64_t _k1
+    if (state.memory[(receiver) * MEMORY_SIZE + 21] != 6):
+        return True
     for _k1 in range(params.wheels_count):
         i = params.wheels[_k1]
         if (((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
@@ -2913,7 +2915,8 @@ cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* para
     suspect = rivals_position_of(source, params)
     if ((odds < 0.01) or (state.bank[(1) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
         return False
-    if (not rivals_witnessed(state, params)):
+    if (not rivals_may_lie(state, suspect, params)):
+        rivals_suspect_motion(state, (1000000000000.0 if 1000000000000.0 < odds else odds))
         return False
     state.stamps[23] = suspect
     for _i in range(2):
@@ -2996,7 +2999,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     cdef double apart
     cdef double blurred
     cdef int64_t i
-    if ((state.bank[(1) * BLOCK + 0] > 0) and (not rivals_witnessed(state, params))):
+    if ((state.bank[(1) * BLOCK + 0] > 0) and (not rivals_may_lie(state, (<int64_t>(state.stamps[23])), params))):
         rivals_close_slot(state, 1)
     blamed = ((not disputed) and ((10.0 * state.bank[(2) * BLOCK + 0]) <= state.bank[(1) * BLOCK + 0]))
     total = state.auxiliary[40]
