@@ -64,6 +64,7 @@ AFTER_S = 60.0  # for which a run goes on after the attack
 HALF_MINUTE, MINUTE, LONG = 30.0, 60.0, 180.0
 MOST_USELESS_S = 5.0  # without a state, or with one that is lost, in an attack with limits
 USELESS = (Mode.ALIGNING, Mode.LOST)
+BACK_S = 5.0  # after an attack, until fixes are fused for good
 RETURNED_S = 0.15  # after the end of an attack, until the last fix that it has touched has arrived
 UNTOUCHED, DEAF, LONG_DEAF = "nothing", "60 s without GNSS", "180 s without GNSS"  # what the others are compared with
 ALL = "wheels"  # of the sources that an attack aims at
@@ -71,7 +72,7 @@ ALL = "wheels"  # of the sources that an attack aims at
 
 class Attack(NamedTuple):
     """What is done, for how long [s], to which source; what it may cost at most: an error [m] beyond that of the reference
-    at the same instant, dishonest seconds; how long the run goes on after it [s]; the reference: the same drive untouched,
+    in the last seconds, dishonest seconds; how long the run goes on after it [s]; the reference: the same drive untouched,
     or without the receiver that lies."""
 
     tamper: Tamper
@@ -196,6 +197,7 @@ def attacked(name: str, seed: int, run: int, trace: bool = False, **keys: Any) -
     events = tampered(name, drive, begin, seed, run)
     found = watch(drive, events, end + attack.after, changed(drive.config, "filter", **keys), ratios=trace)
     other = reference(attack.reference, seed, run)[: len(found.t)]
+    other = np.max([np.roll(other, k) for k in range(round(BACK_S / LOOK_S))], axis=0)  # its worst while GNSS may come back
     excess = (found.distance() - other)[int(np.searchsorted(found.t, begin)) :]
     return found, judged(found, attack, begin, drive.config.filter.v_max_mps, float(np.nanmax(excess, initial=0.0)))
 

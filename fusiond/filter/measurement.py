@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fusiond.filter import gnss_error, rivals, source_health
-from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
+from fusiond.filter.measurement_update import cholesky, correlation_factor, project, update_projected, whiten
 from fusiond.filter.motion_constraints import carried, disputed, is_carried, rests
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, gnss_position, observe, wheel_speed
 from fusiond.filter.observations.gnss_velocity import lowest_speed
@@ -134,7 +134,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     before = source_health.odds_of_bias(memory)
     if not doubtful:
         whitened, lasting = np.empty(3), correlation_of(model, values, parameter)
-        judged, wider = seen.innovation.copy(), np.empty((3, 3))
+        judged, wider, lower = seen.innovation.copy(), np.empty((3, 3)), np.empty((3, 3))
         for a in range(m):
             for b in range(m):
                 wider[a, b] = spread[a, b]
@@ -143,6 +143,10 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             gnss_error.with_whole_error(state, source, values, params, judged, wider)
         if whiten(wider, judged, learnt, m, whitened):
             _judge(state, source, whitened, m, same, t_ns, lasting, params)
+            if model == GNSS_POSITION and cholesky(wider, learnt, 1.0, m, lower):
+                rivals.weigh_consistency(state, source, whitened, lower)
+        if model == GNSS_VELOCITY:
+            rivals.lead_off(state, source, seen.innovation, elapsed, params)
         source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = source_health.is_used(memory, by_rivals)
     if model == WHEEL_SPEED and trusted:
@@ -347,14 +351,19 @@ def _suspect_receiver(state: FilterState, source: int, values: Vector, params: P
 @compiled
 def _suspect_state(state: FilterState, source: int, values: Vector, seen: Observation, params: Parameters) -> None:
     """Where a receiver that is called a liar may be right all the same, as likely as the state is wrong, begin the rival
-    that is where it says."""
-    odds = state.bank[rivals.RECEIVER, 0]
-    if not odds > 0 or state.bank[rivals.RETURN, 0] > 0 or state.stamps[SUSPECT] != source:
+    that is where it says. Where the receiver may not lie, it is the state that is called wrong."""
+    if state.bank[rivals.RETURN, 0] > 0 or state.memory[source, EXCLUDED] != 0:
+        return  # what an excluded one says was weighed when it was found to lie
+    if state.bank[rivals.RECEIVER, 0] > 0:
+        if state.stamps[SUSPECT] != source:
+            return
+        wrong = rivals.wrong(state, is_carried(state, params))
+        odds = state.bank[rivals.RECEIVER, 0] * (wrong / (1 - wrong) / source_health.PRIOR_BIASED)
+    elif rivals.may_lie(state, source, params):
         return
-    if state.memory[source, EXCLUDED] != 0:
-        return  # what it says was weighed when it was found to lie
-    wrong = rivals.wrong(state, is_carried(state, params))
-    odds *= wrong / (1 - wrong) / source_health.PRIOR_BIASED
+    else:
+        odds = source_health.odds_of_bias(state.memory[source]) / 10
+        state.stamps[SUSPECT] = source
     if odds < rivals.BEGIN * (1 + state.bank[rivals.RECEIVER, 0]):
         return
     rivals.open_slot(state, rivals.RETURN, odds)

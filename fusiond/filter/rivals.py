@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from fusiond.events import FIX_FIXED
 from fusiond.filter.measurement_update import cholesky, difference, inject, project, whiten
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
@@ -27,10 +28,13 @@ from fusiond.filter.state import (
     ATTITUDE,
     COASTING,
     EXCLUDED,
+    FIX_TYPE,
     GYRO_BIAS,
     INERTIAL_DOUBT,
     INERTIAL_ODDS,
     LAST_RATIO,
+    LED_OFF,
+    LED_OFF_ODDS,
     MAIN_WEIGHT,
     POSITION,
     POSITION_E,
@@ -61,6 +65,7 @@ LEAD_BY_LOSS = 10.0  # the same of one that does without a receiver, or goes whe
 SHARE_OF_LIAR = 0.1  # chance that a liar reads what would be read if it did not lie
 MAX_ODDS = 1e12  # that one reading gives
 MIN_WEIGHT = 1e-100
+MAX_CONSISTENCY = 20.0  # largest exponent of the odds that a fix gives
 LIE_TURN = 0.03  # rad, by which an inertial sensor that lied may have turned the attitude, per axis
 LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
 LIE_SPEED = 0.05  # m/s, by which the velocity may be off
@@ -221,6 +226,18 @@ def wheels_contradict(state: FilterState, params: Parameters) -> bool:
 
 
 @compiled
+def may_lie(state: FilterState, receiver: int, params: Parameters) -> bool:
+    """Whether a receiver, by its position source, may be called a liar. Not where its ambiguities are fixed, which fits only
+    true carrier phases, and just an inertial sensor contradicts it; any trusted wheel that was heard lately is a witness."""
+    if state.memory[receiver, FIX_TYPE] != FIX_FIXED:
+        return True
+    for i in params.wheels:
+        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[i]):
+            return True
+    return False
+
+
+@compiled
 def open_slot(state: FilterState, slot: int, odds: float) -> None:
     """Begin a rival as a copy of the main state, with odds against that; but not while the state coasts."""
     if state.auxiliary[COASTING] != 0:
@@ -287,15 +304,46 @@ def weigh_liar(state: FilterState, source: int, lie: float, params: Parameters) 
 @compiled
 def suspect_receiver(state: FilterState, source: int, params: Parameters) -> bool:
     """Begin a rival that does without a receiver, where its health (D1) says that it may be biased; and those in which the
-    state has become wrong. Returns whether it has begun."""
+    state has become wrong, which alone begin where it may not lie. Returns whether it has begun."""
     odds = odds_of_bias(state.memory[source])
     suspect = position_of(source, params)
     if odds < BEGIN or state.bank[RECEIVER, 0] > 0 or state.memory[source, EXCLUDED] != 0 or suspect < 0:
         return False
+    if not may_lie(state, suspect, params):
+        suspect_motion(state, min(odds, MAX_ODDS))
+        return False
     state.stamps[SUSPECT] = suspect
+    state.auxiliary[LED_OFF] = 0.0
+    state.auxiliary[LED_OFF_ODDS] = 1.0
     open_slot(state, RECEIVER, min(odds, MAX_ODDS))
     suspect_motion(state, min(odds, MAX_ODDS) / 10)
     return state.bank[RECEIVER, 0] > 0
+
+
+@compiled
+def lead_off(state: FilterState, source: int, innovation: Vector3, elapsed: float, params: Parameters) -> None:
+    """Add to where a suspected receiver's velocity leads, by its innovation (2,) [m/s] over `elapsed` [s]."""
+    if state.bank[RECEIVER, 0] > 0 and int(params.model_parameters[int(state.stamps[SUSPECT]), COMPANION]) == source:
+        for i in range(2):
+            state.auxiliary[LED_OFF.start + i] += innovation[i] * elapsed
+
+
+@compiled
+def weigh_consistency(state: FilterState, source: int, whitened: Vector3, lower: Matrix3) -> None:
+    """Weigh the rival in which a receiver lies by a fix, whose whole error is `whitened` (2,) by L = `lower`: its position
+    must go where its velocity leads. A fix that stays with the state meanwhile speaks for the receiver. Only the newest
+    counts: the errors of fixes are alike."""
+    if not state.bank[RECEIVER, 0] > 0 or state.stamps[SUSPECT] != source:
+        return
+    led = np.empty(2)
+    led[0] = state.auxiliary[LED_OFF.start] / lower[0, 0]
+    led[1] = (state.auxiliary[LED_OFF.start + 1] - lower[1, 0] * led[0]) / lower[1, 1]
+    gained = 0.0
+    for i in range(2):
+        gained += led[i] * (2 * whitened[i] - led[i]) / 2
+    odds = exp(max(min(gained, 0.0), -MAX_CONSISTENCY))
+    state.bank[RECEIVER, 0] *= odds / state.auxiliary[LED_OFF_ODDS]
+    state.auxiliary[LED_OFF_ODDS] = odds
 
 
 @compiled
@@ -333,10 +381,14 @@ def wrong(state: FilterState, carried: bool) -> float:
 
 
 @compiled
-def decide(state: FilterState, disputed: bool, params: Parameters) -> None:
+def decide(  # noqa: PLR0912 - loops
+    state: FilterState, disputed: bool, params: Parameters
+) -> None:
     """Give up rivals that have become unlikely, and let one lead where the expected loss is less so. While the wheels rest
     and the receiver moves (`disputed`), it is not called a liar: the vehicle may be carried. Nor is it while it may well be
     the state that is wrong."""
+    if state.bank[RECEIVER, 0] > 0 and not may_lie(state, int(state.stamps[SUSPECT]), params):
+        close_slot(state, RECEIVER)
     blamed = not disputed and LEAD_BY_LOSS * state.bank[RETURN, 0] <= state.bank[RECEIVER, 0]
     total = state.auxiliary[MAIN_WEIGHT]
     for slot in range(RIVALS):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.study.attacks import ATTACKS, attacked, kept
+from benchmarks.study.attacks import ATTACKS, BACK_S, attacked, kept
 from tests.conftest import needs_compiled
 
 RUNS = {  # of the study, with seed 1
@@ -23,15 +23,10 @@ RUNS = {  # of the study, with seed 1
     "spoof, step of 3 m, then 0.3 m/s, velocity too": 1,
     "jump of 100 m held for 180 s": 0,
 }
-BACK_S = 5.0  # after an attack, until fixes are fused for good
-
-
-LOCKED_OUT = pytest.mark.xfail(strict=True, reason="an honest receiver is called a liar later in the drive")
-CASES = [pytest.param(name, marks=[LOCKED_OUT] if name.startswith("gyro z bias") else []) for name in RUNS]
 
 
 @needs_compiled
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", RUNS)
 def test_worst_attacks(name: str) -> None:
     _, found = attacked(name, 1, RUNS[name])
     assert kept(ATTACKS[name], found) and found.back < BACK_S, found

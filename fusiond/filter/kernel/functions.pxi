@@ -912,9 +912,9 @@ cdef (double, double, double, double) inertial_sample_compare(State* state, doub
         force += portable_square((values[i] - a[(0 + i)]))
         rate += portable_square((values[(3 + i)] - a[(3 + i)]))
     white = (6.0 / (0.0001 if 0.0001 > elapsed else elapsed))
-    _t2 = a[45]
+    _t2 = a[48]
     _t3 = (white * params.noise.accel)
-    _t4 = a[46]
+    _t4 = a[49]
     _t5 = (white * params.noise.gyro)
     return (force, rate, (_t3 if _t3 > _t2 else _t2), (_t5 if _t5 > _t4 else _t4))
 
@@ -944,7 +944,7 @@ cdef bint inertial_sample_is_believed(State* state, double* values, int64_t t_ns
     if (not source_health_is_trusted(state.memory + (params.imu_source) * MEMORY_SIZE)):
         return False
     since = inertial_sample_since_last(state, t_ns, params)
-    if (not (state.auxiliary[47] > since)):
+    if (not (state.auxiliary[50] > since)):
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -981,7 +981,7 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
     t_ns = (<int64_t>row.t_ns)
     since = inertial_sample_since_last(state, t_ns, params)
     if (since == INFINITY):
-        a[47] = 0.0
+        a[50] = 0.0
         return True
     elapsed = ((t_ns - state.stamps[1]) * 1e-09)
     _t1 = inertial_sample_compare(state, values, elapsed, params)
@@ -1001,18 +1001,18 @@ cdef bint inertial_sample_judge(State* state, Row* row, Parameters* params) noex
             else:
                 row.innovation[i] = (values[(3 + i)] - a[(3 + i)])
                 row.variance[i] = (own_rate / 3)
-        if (a[47] > since):
-            a[47] -= since
+        if (a[50] > since):
+            a[50] -= since
             return False
-        a[47] = 0.0
+        a[50] = 0.0
     else:
-        _t3 = (a[47] + since)
-        a[47] = (2.0 if 2.0 < _t3 else _t3)
+        _t3 = (a[50] + since)
+        a[50] = (2.0 if 2.0 < _t3 else _t3)
     share = (since / (1.0 + since))
     _t4 = (16.0 * own_force)
-    a[45] += (share * ((_t4 if _t4 < force else force) - a[45]))
+    a[48] += (share * ((_t4 if _t4 < force else force) - a[48]))
     _t5 = (16.0 * own_rate)
-    a[46] += (share * ((_t5 if _t5 < rate else rate) - a[46]))
+    a[49] += (share * ((_t5 if _t5 < rate else rate) - a[49]))
     return True
 
 cdef (double, double) inertial_sample_doubt(State* state, double* values, int64_t t_ns, int64_t until_ns, bint believed, Parameters* params) noexcept nogil:
@@ -1064,15 +1064,15 @@ cdef void inertial_sample_judge_sensor(State* state, double* values, int64_t t_n
     a = state.auxiliary
     same, fine = inertial_sample_judge_axes(state, values, params), False
     for kind in range(2):
-        change = (a[45] if (kind == 0) else a[46])
-        if (change >= (3 * portable_square((4.0 * a[(54 + kind)])))):
+        change = (a[48] if (kind == 0) else a[49])
+        if (change >= (3 * portable_square((4.0 * a[(57 + kind)])))):
             fine = True
     if (fine or (not same)):
         source_health_judge_repetition(memory, state.source_stamps + (params.imu_source) * SOURCE_STAMPS_SIZE, same, t_ns)
     if (memory[20] > 0):
         odds = 0.0
         for i in range(6):
-            _t1 = state.auxiliary[(58 + i)]
+            _t1 = state.auxiliary[(61 + i)]
             odds = (_t1 if _t1 > odds else odds)
         source_health_blame_frozen(memory, (odds / (1 + odds)))
 
@@ -1115,22 +1115,22 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
             sensed = 0.0
             for j in range(3):
                 sensed += (turn[((0 + (3 * j)) + i)] * values[(first + j)])
-            moved[i] = fabs((sensed - a[((48 + first) + i)]))
-            a[((48 + first) + i)] = sensed
-            _t1 = a[(56 + kind)]
+            moved[i] = fabs((sensed - a[((51 + first) + i)]))
+            a[((51 + first) + i)] = sensed
+            _t1 = a[(59 + kind)]
             _t2 = fabs(sensed)
-            a[(56 + kind)] = (_t2 if _t2 > _t1 else _t1)
+            a[(59 + kind)] = (_t2 if _t2 > _t1 else _t1)
             if (moved[i] > 1e-09):
                 same = False
-                if ((a[(54 + kind)] == 0) or (moved[i] < a[(54 + kind)])):
-                    a[(54 + kind)] = moved[i]
-        least, lively = (4.0 * a[(54 + kind)]), 0
+                if ((a[(57 + kind)] == 0) or (moved[i] < a[(57 + kind)])):
+                    a[(57 + kind)] = moved[i]
+        least, lively = (4.0 * a[(57 + kind)]), 0
         for i in range(3):
             lively += (1 if (moved[i] > least) else 0)
         for i in range(3):
             k = (first + i)
             changed = (moved[i] > 1e-09)
-            _t3 = a[(58 + k)]
+            _t3 = a[(61 + k)]
             _t4 = 1e-06
             odds = (_t4 if _t4 > _t3 else _t3)
             if changed:
@@ -1139,16 +1139,16 @@ cdef bint inertial_sample_judge_axes(State* state, double* values, Parameters* p
                 odds = (_t6 if _t6 > _t5 else _t5)
             if ((lively - (1 if (moved[i] > least) else 0)) == 2):
                 if (not changed):
-                    _t7 = (1 - a[(64 + k)])
+                    _t7 = (1 - a[(67 + k)])
                     _t8 = (0.3333333333333333 if 0.3333333333333333 > _t7 else _t7)
                     chance = (0.95 if 0.95 < _t8 else _t8)
                     _t9 = (odds / chance)
                     odds = (1000.0 if 1000.0 < _t9 else _t9)
-                a[(64 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(64 + k)]))
-            a[(58 + k)] = odds
+                a[(67 + k)] += (0.01 * ((1.0 if changed else 0.0) - a[(67 + k)]))
+            a[(61 + k)] = odds
             if (odds > worst):
                 worst = odds
-                saturated = (fabs(a[(48 + k)]) >= a[(56 + kind)])
+                saturated = (fabs(a[(51 + k)]) >= a[(59 + kind)])
                 place = ((1.0 + k) + (6 if saturated else 0))
     memory[20] = place
     return same
@@ -1274,6 +1274,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double judged[3]
     cdef int _i
     cdef double wider[3 * 3]
+    cdef double lower[3 * 3]
     cdef int64_t b
     cdef bint trusted
     cdef double noisy
@@ -1340,6 +1341,10 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
             gnss_error_with_whole_error(state, source, values, params, judged, wider)
         if measurement_update_whiten(wider, judged, learnt, m, whitened):
             measurement__judge(state, source, whitened, m, same, t_ns, lasting, params)
+            if ((model == 0) and measurement_update_cholesky(wider, learnt, 1.0, m, lower)):
+                rivals_weigh_consistency(state, source, whitened, lower)
+        if (model == 1):
+            rivals_lead_off(state, source, seen.innovation, elapsed, params)
         source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
     trusted = source_health_is_used(memory, by_rivals)
     if ((model == 2) and trusted):
@@ -1384,7 +1389,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         stamps[1] = t_ns
         if (model == 0):
             state.stamps[4] = t_ns
-            state.auxiliary[44] = 0.0
+            state.auxiliary[47] = 0.0
     elif (stamps[2] == (<int64_t>-4611686018427387904)):
         stamps[2] = t_ns
     if ((model == 2) and (not fused)):
@@ -1543,16 +1548,21 @@ cdef void measurement__suspect_receiver(State* state, int64_t source, double* va
         gnss_error_forget_prior(&rival, source, values, params)
 
 cdef void measurement__suspect_state(State* state, int64_t source, double* values, Observation* seen, Parameters* params) noexcept nogil:
-    cdef double odds
     cdef double wrong
+    cdef double odds
     cdef State rival
-    odds = state.bank[(1) * BLOCK + 0]
-    if ((not (odds > 0)) or (state.bank[(2) * BLOCK + 0] > 0) or (state.stamps[23] != source)):
+    if ((state.bank[(2) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0)):
         return
-    if (state.memory[(source) * MEMORY_SIZE + 18] != 0):
+    if (state.bank[(1) * BLOCK + 0] > 0):
+        if (state.stamps[23] != source):
+            return
+        wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
+        odds = (state.bank[(1) * BLOCK + 0] * ((wrong / (1 - wrong)) / 0.001))
+    elif rivals_may_lie(state, source, params):
         return
-    wrong = rivals_wrong(state, motion_constraints_is_carried(state, params))
-    odds *= ((wrong / (1 - wrong)) / 0.001)
+    else:
+        odds = (source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE) / 10)
+        state.stamps[23] = source
     if (odds < (0.01 * (1 + state.bank[(1) * BLOCK + 0]))):
         return
     rivals_open_slot(state, 2, odds)
@@ -2001,8 +2011,8 @@ cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt,
     cdef double missing
     if ((state.stamps[10] != 2) or (not motion_constraints_rests(state, params)) or motion_constraints_carried(state, 0.0, params)):
         _t1 = 0.0
-        state.auxiliary[42] = _t1
-        state.auxiliary[43] = _t1
+        state.auxiliary[45] = _t1
+        state.auxiliary[46] = _t1
         return
     wgs84_mat_ne(state.nominal, _t2)
     down_e = _t2 + (2) * 3
@@ -2016,11 +2026,11 @@ cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt,
         turning += (down_e[i] * rate_e[i])
     _t5 = (fabs(turning) - motion_constraints_turn_shown(state, params))
     unseen = (0.0 if 0.0 > _t5 else _t5)
-    state.auxiliary[42] += ((unseen * dt) if (turning > 0) else ((-unseen) * dt))
-    turned, doubted = fabs(state.auxiliary[42]), state.auxiliary[43]
+    state.auxiliary[45] += ((unseen * dt) if (turning > 0) else ((-unseen) * dt))
+    turned, doubted = fabs(state.auxiliary[45]), state.auxiliary[46]
     if (turned <= doubted):
         return
-    state.auxiliary[43] = turned
+    state.auxiliary[46] = turned
     variance = 0.0
     for i in range(3):
         for j in range(3):
@@ -2777,7 +2787,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     cdef State rival
     cdef int64_t k
     state.auxiliary[41] = 1e-06
-    if (state.auxiliary[70] != 0):
+    if (state.auxiliary[73] != 0):
         return
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
@@ -2864,13 +2874,24 @@ cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept no
                 against += 1
     return ((2 * against) > heard)
 
+cdef bint rivals_may_lie(State* state, int64_t receiver, Parameters* params) noexcept nogil:
+    cdef int64_t i
+    cdef int64_t _k1
+    if (state.memory[(receiver) * MEMORY_SIZE + 21] != 6):
+        return True
+    for _k1 in range(params.wheels_count):
+        i = params.wheels[_k1]
+        if (((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+            return True
+    return False
+
 cdef void rivals_open_slot(State* state, int64_t slot, double odds) noexcept nogil:
     cdef double _t1
     cdef double _t2
     cdef State rival
     cdef int _i
     cdef int64_t k
-    if (state.auxiliary[70] != 0):
+    if (state.auxiliary[73] != 0):
         return
     if (state.stamps[22] == 0):
         state.auxiliary[40] = 1.0
@@ -2929,14 +2950,47 @@ cdef void rivals_weigh_liar(State* state, int64_t source, double lie, Parameters
 cdef bint rivals_suspect_receiver(State* state, int64_t source, Parameters* params) noexcept nogil:
     cdef double odds
     cdef int64_t suspect
+    cdef int _i
     odds = source_health_odds_of_bias(state.memory + (source) * MEMORY_SIZE)
     suspect = rivals_position_of(source, params)
     if ((odds < 0.01) or (state.bank[(1) * BLOCK + 0] > 0) or (state.memory[(source) * MEMORY_SIZE + 18] != 0) or (suspect < 0)):
         return False
+    if (not rivals_may_lie(state, suspect, params)):
+        rivals_suspect_motion(state, (1000000000000.0 if 1000000000000.0 < odds else odds))
+        return False
     state.stamps[23] = suspect
+    for _i in range(2):
+        (state.auxiliary + 42)[_i] = 0.0
+    state.auxiliary[44] = 1.0
     rivals_open_slot(state, 1, (1000000000000.0 if 1000000000000.0 < odds else odds))
     rivals_suspect_motion(state, ((1000000000000.0 if 1000000000000.0 < odds else odds) / 10))
     return (state.bank[(1) * BLOCK + 0] > 0)
+
+cdef void rivals_lead_off(State* state, int64_t source, double* innovation, double elapsed, Parameters* params) noexcept nogil:
+    cdef int64_t i
+    if ((state.bank[(1) * BLOCK + 0] > 0) and ((<int64_t>(params.model_parameters[((<int64_t>(state.stamps[23]))) * PARAMETERS + 11])) == source)):
+        for i in range(2):
+            state.auxiliary[(42 + i)] += (innovation[i] * elapsed)
+
+cdef void rivals_weigh_consistency(State* state, int64_t source, double* whitened, double* lower) noexcept nogil:
+    cdef double led[2]
+    cdef double gained
+    cdef int64_t i
+    cdef double _t1
+    cdef double _t2
+    cdef double odds
+    if ((not (state.bank[(1) * BLOCK + 0] > 0)) or (state.stamps[23] != source)):
+        return
+    led[0] = (state.auxiliary[42] / lower[(0) * 3 + 0])
+    led[1] = ((state.auxiliary[(42 + 1)] - (lower[(1) * 3 + 0] * led[0])) / lower[(1) * 3 + 1])
+    gained = 0.0
+    for i in range(2):
+        gained += ((led[i] * ((2 * whitened[i]) - led[i])) / 2)
+    _t1 = (0.0 if 0.0 < gained else gained)
+    _t2 = (-20.0)
+    odds = portable_exp((_t2 if _t2 > _t1 else _t1))
+    state.bank[(1) * BLOCK + 0] *= (odds / state.auxiliary[44])
+    state.auxiliary[44] = odds
 
 cdef bint rivals_fits_again(State* state, int64_t source, double* whitened, int64_t m, Parameters* params) noexcept nogil:
     cdef int64_t companion
@@ -2965,7 +3019,7 @@ cdef double rivals_wrong(State* state, bint carried) noexcept nogil:
     if carried:
         return 0.9
     since = ((state.stamps[0] - state.stamps[4]) * 1e-09)
-    _t1 = (state.auxiliary[44] + portable_square((since / 200.0)))
+    _t1 = (state.auxiliary[47] + portable_square((since / 200.0)))
     return (0.9 if 0.9 < _t1 else _t1)
 
 cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcept nogil:
@@ -2985,6 +3039,8 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     cdef double apart
     cdef double blurred
     cdef int64_t i
+    if ((state.bank[(1) * BLOCK + 0] > 0) and (not rivals_may_lie(state, (<int64_t>(state.stamps[23])), params))):
+        rivals_close_slot(state, 1)
     blamed = ((not disputed) and ((10.0 * state.bank[(2) * BLOCK + 0]) <= state.bank[(1) * BLOCK + 0]))
     total = state.auxiliary[40]
     for slot in range(4):
@@ -3041,7 +3097,7 @@ cdef void rivals__lead(State* state, int64_t slot, Parameters* params) noexcept 
         if (not ((slot == 1) and (other == 0))):
             rivals_close_slot(state, other)
     if (slot == 0):
-        state.auxiliary[44] = 0.5
+        state.auxiliary[47] = 0.5
         state_count_reset(state, 6)
         for source in range(state.sources):
             state.memory[(source) * MEMORY_SIZE + 18] = 0.0
@@ -3522,7 +3578,7 @@ cdef void step_advance_all(State* state, int64_t t_ns, Row* imu, Parameters* par
     cdef State rival
     begin = (<int64_t>(state.stamps[0]))
     step_advance(state, t_ns, imu, params)
-    if ((state.stamps[22] > 0) and (state.auxiliary[70] != 0)):
+    if ((state.stamps[22] > 0) and (state.auxiliary[73] != 0)):
         rivals_close_all(state)
     if (state.stamps[22] > 0):
         for slot in range(4):
@@ -3736,7 +3792,7 @@ cdef void step_hold(State* state, double* values, int64_t t_ns) noexcept nogil:
         a[(0 + i)] = _t1
         a[(6 + i)] = _t1
         a[(3 + i)] = values[(3 + i)]
-        if (a[70] == 0.0):
+        if (a[73] == 0.0):
             a[(9 + i)] = values[(3 + i)]
 
 cdef void step_guard(State* state) noexcept nogil:
@@ -4171,17 +4227,17 @@ cdef void strapdown_begin_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[70] == 0.0):
-        a[70] = 1.0
+    if (a[73] == 0.0):
+        a[73] = 1.0
         for _i in range(3):
-            (a + 71)[_i] = (state.nominal + 10)[_i]
+            (a + 74)[_i] = (state.nominal + 10)[_i]
         for i in range(3):
             for j in range(3):
-                a[((74 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
+                a[((77 + (3 * i)) + j)] = p[((bias + i)) * n + (bias + j)]
     for _i in range(3):
-        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 71)[_i])
+        (a + 9)[_i] -= ((state.nominal + 10)[_i] - (a + 74)[_i])
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 71)[_i]
+        (state.nominal + 10)[_i] = (a + 74)[_i]
     a[36] = (0.05 * 0.05)
 
 cdef void strapdown_end_coasting(State* state) noexcept nogil:
@@ -4194,11 +4250,11 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
     a = state.auxiliary
     p = state.covariance
     bias = 9
-    if (a[70] == 0.0):
+    if (a[73] == 0.0):
         return
-    a[70] = 0.0
+    a[73] = 0.0
     for _i in range(3):
-        (state.nominal + 10)[_i] = (a + 71)[_i]
+        (state.nominal + 10)[_i] = (a + 74)[_i]
     for i in range(3):
         for _i in range(n):
             (p + ((bias + i)) * n)[_i] = 0.0
@@ -4206,7 +4262,7 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
             (p + (bias + i))[_i * n] = 0.0
     for i in range(3):
         for j in range(3):
-            p[((bias + i)) * n + (bias + j)] = a[((74 + (3 * i)) + j)]
+            p[((bias + i)) * n + (bias + j)] = a[((77 + (3 * i)) + j)]
 
 cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double* x

@@ -252,7 +252,6 @@ def test_no_fault_no_alarm() -> None:
 
 
 @needs_compiled
-@pytest.mark.xfail(strict=True, reason="a receiver that is found to lie while the state is wrong is locked out")
 def test_after_an_outage_it_is_believed_again() -> None:
     """Ten minutes without GNSS, then fixes that lie outside what the filter expected: not at once, but in 5 s."""
     truth = drive(70.0, lambda t: 10.0 + np.sin(0.3 * t), lambda t: 0.02 * t, rate=50.0)
