@@ -25,7 +25,7 @@ demo: $(READY)
 	$(BIN)/fusiond demo --out out/demo
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 ros:
 	$(PYTHON) -m venv build/ros

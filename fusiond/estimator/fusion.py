@@ -197,7 +197,7 @@ class Fusion:
         published = solution_state(state, self.history.kernel)
         north, east, _ = published.sigma_position_n()
         mode = Mode.NOMINAL
-        if math.hypot(north, east) > self.params.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
+        if not math.hypot(north, east) <= self.params.filter.lost_sigma_m or age is None or age > LOST_IMU_NS:
             mode = Mode.LOST
         elif t_ns - int(stamps[T_POSITION]) > nanoseconds(self.params.filter.position_timeout_s):
             mode = Mode.DEAD_RECKONING

@@ -82,7 +82,9 @@ class SolutionState:
         return self._sigma(8)
 
     def _sigma(self, index: int) -> float:
-        return math.sqrt(float(self.covariance[index, index]))
+        """The root of a variance; NaN where that is negative, as rounding leaves it in a state that has lost all meaning."""
+        variance = float(self.covariance[index, index])
+        return math.sqrt(variance) if variance >= 0 else math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

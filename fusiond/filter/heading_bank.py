@@ -44,7 +44,7 @@ from fusiond.filter.state import (
     T,
     Verdict,
     count_reset,
-    is_finite,
+    is_sound,
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.typed import ErrorRows3, Matrix3, Vector, compiled
@@ -183,7 +183,7 @@ def normalise(state: FilterState) -> None:
     total = 0.0
     for i in range(HYPOTHESES):
         hypothesis = state.hypothesis(i)
-        if not (state.bank[i, 0] > 0 and math.isfinite(state.bank[i, 0]) and is_finite(hypothesis)):
+        if not (state.bank[i, 0] > 0 and math.isfinite(state.bank[i, 0]) and is_sound(hypothesis)):
             state.bank[i, 0] = 0.0
         total += state.bank[i, 0]
     for i in range(HYPOTHESES):

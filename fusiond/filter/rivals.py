@@ -48,7 +48,7 @@ from fusiond.filter.state import (
     ResetReason,
     T,
     count_reset,
-    is_finite,
+    is_sound,
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
@@ -394,7 +394,7 @@ def decide(  # noqa: PLR0912 - loops
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
             hypothesis = state.hypothesis(slot)
-            if not is_finite(hypothesis):
+            if not is_sound(hypothesis):
                 close_slot(state, slot)
             total += state.bank[slot, 0]
     state.auxiliary[MAIN_WEIGHT] = max(state.auxiliary[MAIN_WEIGHT] / total, MIN_WEIGHT)

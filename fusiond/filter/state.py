@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from fusiond.maths.typed import Array, Stamps, compiled
+from fusiond.maths.wgs84 import SEMI_MAJOR
 
 
 class _Layout:
@@ -266,8 +267,13 @@ class FilterState:
 
 
 @compiled
-def is_finite(state: FilterState) -> bool:
-    """Whether the nominal state and its variances are finite."""
+def is_sound(state: FilterState) -> bool:
+    """Whether the nominal state and its variances are finite, and the position is known to better than the Earth's size."""
+    spread = 0.0
+    for i in range(POSITION.start, POSITION.stop):
+        spread += state.covariance[i, i]
+    if not 0 <= spread < SEMI_MAJOR * SEMI_MAJOR:
+        return False
     total = 0.0
     for i in range(len(state.nominal)):
         total += state.nominal[i]

@@ -51,7 +51,7 @@ from fusiond.filter.state import (
     ResetReason,
     T,
     count_reset,
-    is_finite,
+    is_sound,
 )
 from fusiond.filter.strapdown import COAST_SWAY, COAST_TURN, add_white_noise, coast, end_coasting, propagate
 from fusiond.maths.portable import square
@@ -384,12 +384,12 @@ def hold(state: FilterState, values: Vector, t_ns: int) -> None:
 
 @compiled
 def guard(state: FilterState) -> None:
-    """If the state is no longer finite, or no hypothesis is left, empty it and align again. Never expected; counted."""
+    """If the state is no longer sound, or no hypothesis is left, empty it and align again. Never expected; counted."""
     if state.stamps[PHASE] == CHOOSING:
         for i in range(HYPOTHESES):
             if state.bank[i, 0] > 0:
                 return
-    elif is_finite(state):
+    elif is_sound(state):
         return
     resets, blown = int(state.stamps[RESETS]), int(state.stamps[BLOWN])
     state.clear()

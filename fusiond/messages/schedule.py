@@ -254,7 +254,7 @@ class Changes:
             ResetReason.NONE: "",
             ResetReason.DATA_GAP: f"no data for more than {self._config.filter.restart_gap_s:g} s; aligning again",
             ResetReason.HEADING_LOST: "the heading was lost without the IMU; aligning again",
-            ResetReason.NOT_FINITE: "the state was not finite; aligning again",
+            ResetReason.NOT_FINITE: "the state had lost all meaning; aligning again",
             ResetReason.SOURCE_RETURNED: f"{source}: the state contradicted it and was likelier to be wrong; set to it",
             ResetReason.INERTIAL_LIED: "the inertial sensor contradicted all others; its part was taken back",
             ResetReason.TIME_STEPPED_BACK: "receipt stamps stepped back, a new session; aligning again",

@@ -719,7 +719,7 @@ cdef void heading_bank_normalise(State* state) noexcept nogil:
     total = 0.0
     for i in range(13):
         hypothesis = hypothesis_of(state, i)
-        if (not ((state.bank[(i) * BLOCK + 0] > 0) and isfinite(state.bank[(i) * BLOCK + 0]) and state_is_finite(&hypothesis))):
+        if (not ((state.bank[(i) * BLOCK + 0] > 0) and isfinite(state.bank[(i) * BLOCK + 0]) and state_is_sound(&hypothesis))):
             state.bank[(i) * BLOCK + 0] = 0.0
         total += state.bank[(i) * BLOCK + 0]
     for i in range(13):
@@ -3046,7 +3046,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
             hypothesis = hypothesis_of(state, slot)
-            if (not state_is_finite(&hypothesis)):
+            if (not state_is_sound(&hypothesis)):
                 rivals_close_slot(state, slot)
             total += state.bank[(slot) * BLOCK + 0]
     _t1 = (state.auxiliary[40] / total)
@@ -3445,9 +3445,15 @@ cdef void source_health_note_rejected(double* memory, double reading, double inn
 
 # ---------------- fusiond.filter.state
 
-cdef bint state_is_finite(State* state) noexcept nogil:
-    cdef double total
+cdef bint state_is_sound(State* state) noexcept nogil:
+    cdef double spread
     cdef int64_t i
+    cdef double total
+    spread = 0.0
+    for i in range(0, 3):
+        spread += state.covariance[(i) * n + i]
+    if (not (0 <= spread < (6378137.0 * 6378137.0))):
+        return False
     total = 0.0
     for i in range(NOMINAL_SIZE):
         total += state.nominal[i]
@@ -3803,7 +3809,7 @@ cdef void step_guard(State* state) noexcept nogil:
         for i in range(13):
             if (state.bank[(i) * BLOCK + 0] > 0):
                 return
-    elif state_is_finite(state):
+    elif state_is_sound(state):
         return
     resets, blown = (<int64_t>(state.stamps[11])), (<int64_t>(state.stamps[18]))
     clear_state(state)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -128,3 +130,15 @@ def test_a_hypothesis_is_a_state_that_shares_all_but_its_own() -> None:
 def test_every_verdict_has_its_words() -> None:
     assert set(hot_start.WORDS) == set(Verdict)
     assert len(set(hot_start.WORDS.values())) == len(Verdict)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "sound"),
+    [((0, 0), 1e12, True), ((1, 1), 1e14, False), ((2, 2), -1e6, False), ((4, 4), math.inf, False), ((2, 2), math.nan, False)],
+)
+def test_a_state_is_sound_while_its_place_is_known(place: tuple[int, int], value: float, sound: bool) -> None:
+    """To better than the Earth's size: one that is not begins anew, before its sums overflow."""
+    found = running_state(np.random.default_rng(1))
+    assert state.is_sound(found)
+    found.covariance[place] = value
+    assert state.is_sound(found) is sound
