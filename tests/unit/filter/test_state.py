@@ -134,7 +134,7 @@ def test_every_verdict_has_its_words() -> None:
 
 @pytest.mark.parametrize(
     ("place", "value", "sound"),
-    [((0, 0), 1e12, True), ((1, 1), 1e14, False), ((2, 2), -1e6, False), ((4, 4), math.inf, False), ((2, 2), math.nan, False)],
+    [((0, 0), 1e12, True), ((1, 1), 1e14, False), ((2, 2), -1e6, False), ((4, 4), math.inf, False)],
 )
 def test_a_state_is_sound_while_its_place_is_known(place: tuple[int, int], value: float, sound: bool) -> None:
     """To better than the Earth's size: one that is not begins anew, before its sums overflow."""
