@@ -71,6 +71,7 @@ LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
 LIE_SPEED = 0.05  # m/s, by which the velocity may be off
 LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
 WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer says nothing
+VELOCITY_FRESH_NS = 10 * SECOND  # nor does a receiver's velocity
 FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
 FIRST = 0.1  # of these variances, that a lie has for certain
 LARGER = 0.3  # chance that a lie is larger than that
@@ -349,9 +350,11 @@ def weigh_consistency(state: FilterState, source: int, whitened: Vector3, lower:
 @compiled
 def fits_again(state: FilterState, source: int, whitened: Vector3, m: int, params: Parameters) -> bool:
     """Whether the positions of a receiver that was found to lie are taken back: by its whitened innovation (m,), it reads
-    what a good one does on average. It must not be said of a receiver whose velocity still lies: a lie begins small."""
+    what a good one does on average. It must not be said of a receiver whose velocity is heard and still lies: a lie begins
+    small."""
     companion = int(params.model_parameters[source, COMPANION])
-    if companion >= 0 and state.memory[companion, EXCLUDED] != 0:
+    silent = companion < 0 or state.stamps[T] - state.source_stamps[companion, T_LAST] > VELOCITY_FRESH_NS
+    if not silent and state.memory[companion, EXCLUDED] != 0:
         return False
     distance = 0.0
     for a in range(m):

@@ -2994,10 +2994,12 @@ cdef void rivals_weigh_consistency(State* state, int64_t source, double* whitene
 
 cdef bint rivals_fits_again(State* state, int64_t source, double* whitened, int64_t m, Parameters* params) noexcept nogil:
     cdef int64_t companion
+    cdef bint silent
     cdef double distance
     cdef int64_t a
     companion = (<int64_t>(params.model_parameters[(source) * PARAMETERS + 11]))
-    if ((companion >= 0) and (state.memory[(companion) * MEMORY_SIZE + 18] != 0)):
+    silent = ((companion < 0) or ((state.stamps[0] - state.source_stamps[(companion) * SOURCE_STAMPS_SIZE + 0]) > (<int64_t>10000000000)))
+    if ((not silent) and (state.memory[(companion) * MEMORY_SIZE + 18] != 0)):
         return False
     distance = 0.0
     for a in range(m):

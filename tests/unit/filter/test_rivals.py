@@ -22,17 +22,22 @@ from fusiond.filter.state import (
     BIASED,
     COASTING,
     EXCLUDED,
+    FIX_TYPE,
     GYRO_BIAS,
     INERTIAL_DOUBT,
     INERTIAL_ODDS,
+    LED_OFF,
+    LED_OFF_ODDS,
     MAIN_WEIGHT,
     NOMINAL,
     POSITION,
     POSITION_E,
     RESET_SOURCE,
     SUSPECT,
+    T_LAST,
     FilterState,
     ResetReason,
+    T,
 )
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import ecef, mat_ne
@@ -167,6 +172,41 @@ def test_the_rival_of_a_liar_leads() -> None:
     assert state.memory[[PLACE, SPEED], EXCLUDED].tolist() == [1.0, 1.0]
     assert state.memory[PLACE, NOMINAL] == PRIOR[BIASED - NOMINAL]  # until its readings say otherwise
     assert state.bank[rivals.RECEIVER, 0] == state.bank[rivals.WHEELS, 0] == 0
+
+
+def test_positions_wait_for_a_velocity_that_lies_but_not_for_one_that_is_silent() -> None:
+    state, near, far = running_state(np.random.default_rng(6)), np.array([1.0, -1.0, 0.0]), np.array([2.0, -1.0, 0.0])
+    state.memory[[PLACE, SPEED], EXCLUDED] = 1.0
+    assert rivals.fits_again(state, PLACE, near, 2, PARAMS)  # none was ever heard
+    state.source_stamps[SPEED, T_LAST] = state.stamps[T] - rivals.VELOCITY_FRESH_NS
+    assert not rivals.fits_again(state, PLACE, near, 2, PARAMS)
+    state.stamps[T] += 1
+    assert rivals.fits_again(state, PLACE, near, 2, PARAMS)
+    assert not rivals.fits_again(state, PLACE, far, 2, PARAMS)
+
+
+@pytest.mark.parametrize(("fix_type", "wheel", "may"), [(3, False, True), (6, False, False), (6, True, True)])
+def test_fixed_ambiguities_are_only_doubted_with_a_witness(fix_type: int, wheel: bool, may: bool) -> None:
+    params, state = make_parameters(config(("rear_left",))), running_state(np.random.default_rng(6))
+    receiver = params.sources.index("gps0.position")
+    state.memory[receiver, FIX_TYPE] = fix_type
+    if wheel:
+        state.source_stamps[list(params.wheels), T_LAST] = state.stamps[T]
+    assert rivals.may_lie(state, receiver, params) is may
+
+
+def test_a_fix_that_is_not_led_off_speaks_for_its_receiver() -> None:
+    """Three sigmas between where the velocity leads and where the fix is: exp(-9 / 2). Only the newest counts."""
+    state, lower = contended(7, (rivals.RECEIVER,)), 0.5 * np.eye(3)
+    begin = float(state.bank[rivals.RECEIVER, 0])
+    state.auxiliary[LED_OFF], state.auxiliary[LED_OFF_ODDS] = 0.0, 1.0
+    for _ in range(3):
+        rivals.lead_off(state, SPEED, np.array([0.5, 0.0, 0.0]), 1.0, PARAMS)
+    for _ in range(4):
+        rivals.weigh_consistency(state, PLACE, np.zeros(3), lower)
+    assert state.bank[rivals.RECEIVER, 0] == pytest.approx(begin * math.exp(-4.5), rel=1e-12)
+    rivals.weigh_consistency(state, PLACE, np.array([3.0, 0.0, 0.0]), lower)  # the position goes along
+    assert state.bank[rivals.RECEIVER, 0] == pytest.approx(begin, rel=1e-12)
 
 
 def test_a_receiver_that_was_right_leads_back() -> None:
