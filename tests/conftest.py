@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 
 from fusiond.filter.kernel.interpreted import compiled_available
@@ -13,3 +15,9 @@ needs_compiled = pytest.mark.skipif(not compiled_available(), reason="the compil
 def compiled(request: pytest.FixtureRequest) -> bool:
     """Which kernel to ask for."""
     return bool(request.param)
+
+
+def pytest_configure() -> None:
+    """What is started in the background ignores SIGINT, and hands that on to all that it starts: not so the tests."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
