@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
 from typing import Literal
 
+from fusiond.app.client import Client
 from fusiond.config.outputs import Encoding, Publish, Zenoh
 from fusiond.config.schema import Config, Vehicle
 from fusiond.messages.types import EventMessage, Message
@@ -55,3 +57,11 @@ def publishing(config: Config, *first: Message) -> Iterator[ZenohOutput]:
 
 def event(text: str) -> EventMessage:
     return EventMessage(vehicle="rover", t_ns=1, kind="mode", severity="info", subject="", text=text)
+
+
+def sees(client: Client, vehicle: str) -> bool:
+    """Whether a client sees that a vehicle is alive within 10 s: what was declared a moment ago takes its way."""
+    ends = time.monotonic() + 10.0
+    while client.alive() != {vehicle} and time.monotonic() < ends:
+        time.sleep(0.05)
+    return client.alive() == {vehicle}

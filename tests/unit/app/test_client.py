@@ -25,7 +25,7 @@ from fusiond.units import SECOND
 from tests.helpers.estimates import random_messages as states
 from tests.helpers.network import DEADLINE, python, read_line
 from tests.helpers.paths import ROOT
-from tests.helpers.zenoh import endpoint, event, publishing, settings
+from tests.helpers.zenoh import endpoint, event, publishing, sees, settings
 
 CONFIG = ConfigMessage(vehicle="rover", config={"vehicle": {"name": "rover"}})
 HEALTH = HealthMessage(
@@ -49,7 +49,7 @@ def test_queries_return_what_was_published(encoding: Encoding, mode: Literal["pe
         output.outbox.put(event("then"))
         assert next(heard) == event("then")
         assert (client.info(), client.config(), client.latest(StateMessage)) == (INFO, CONFIG, published[-1])
-        assert client.alive() == {"rover"}
+        assert sees(client, "rover")
         for message in published:
             assert client.state_at(message.t_ns) == message
         between = published[7].t_ns + 4_000_000

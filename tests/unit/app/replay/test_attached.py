@@ -38,6 +38,7 @@ from fusiond.messages import (
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.zenoh.session import alive_key, open_session
 from tests.helpers.drive import LOGS, folder
+from tests.helpers.zenoh import sees
 
 DEADLINE = 15.0  # s
 LIVE = {StateMessage, SettledMessage, InnovationMessage, EventMessage, HealthMessage, InfoMessage, ConfigMessage}
@@ -138,7 +139,7 @@ def test_a_replay_in_real_time_answers_as_a_daemon_does(tmp_path: Path) -> None:
     thread.start()
     try:
         with eventually(lambda: Client(endpoint, "tested", timeout_s=1.0)) as client:
-            assert client.alive() == {"tested"}
+            assert sees(client, "tested")
             assert eventually(client.info).sources["imu0"] == "imu"
             assert client.config().config["vehicle"]["name"] == "tested"
             states = client.stream(StateMessage, DEADLINE)
