@@ -45,6 +45,7 @@ from fusiond.filter.state import (
     Verdict,
     count_reset,
     is_sound,
+    variance_about,
 )
 from fusiond.maths.linear import mirror
 from fusiond.maths.typed import ErrorRows3, Matrix3, Vector, compiled
@@ -218,22 +219,12 @@ def collapse_if_close(state: FilterState, params: Parameters) -> None:
     for i in range(HYPOTHESES):
         if state.bank[i, 0] > 0:
             hypothesis = state.hypothesis(i)
-            own = _variance_along(hypothesis, down[0], down[1], down[2])
+            own = variance_about(hypothesis, down[0], down[1], down[2])
             spread += state.bank[i, 0] * (own + (turns[i] - mean) * (turns[i] - mean))
             if abs(turns[i]) > FAR:
                 doubt += state.bank[i, 0]
     if spread <= params.heading_variance and doubt <= DOUBT:
         _collapse(state, best, errors)
-
-
-@compiled
-def _variance_along(hypothesis: FilterState, x: float, y: float, z: float) -> float:
-    """Variance of the rotation about an earth-fixed axis (x, y, z) [rad^2]."""
-    p, phi = hypothesis.covariance, ATTITUDE.start
-    turned = np.empty(3)
-    for a in range(3):
-        turned[a] = p[phi + a, phi] * x + p[phi + a, phi + 1] * y + p[phi + a, phi + 2] * z
-    return x * turned[0] + y * turned[1] + z * turned[2]
 
 
 @compiled

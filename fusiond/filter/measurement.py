@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from fusiond.filter import gnss_error, rivals, source_health
-from fusiond.filter.measurement_update import cholesky, correlation_factor, project, update_projected, whiten
-from fusiond.filter.motion_constraints import carried, disputed, is_carried, rests
+from fusiond.filter.measurement_update import correlation_factor, project, update_projected, whiten
+from fusiond.filter.motion_constraints import carried, disputed, is_carried
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED, gnss_position, observe, wheel_speed
 from fusiond.filter.observations.gnss_velocity import lowest_speed
 from fusiond.filter.observations.model import (
@@ -48,7 +48,6 @@ from fusiond.maths.typed import Stamps, Vector, Vector3, compiled
 
 HORIZONTAL = 2  # axes of a fix that are judged together; its height is judged apart
 DOUBT_TIME = 30.0  # s, after which a height that is rejected is fused
-OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
 
 
 @compiled
@@ -126,7 +125,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             seen.variance[a] = learnt[a]
         rivals.fit_lie(state, seen, across, spread)
     weight = factor_of(stamps, model, values, parameter, t_ns)
-    if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > OUTAGE_NS:
+    if stamps[T_LAST] == NEVER or t_ns - stamps[T_LAST] > source_health.OUTAGE_NS:
         stamps[T_FUSED] = NEVER
         source_health.begin(memory)
     by_rivals = model in (GNSS_POSITION, GNSS_VELOCITY)
@@ -134,7 +133,7 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     before = source_health.odds_of_bias(memory)
     if not doubtful:
         whitened, lasting = np.empty(3), correlation_of(model, values, parameter)
-        judged, wider, lower = seen.innovation.copy(), np.empty((3, 3)), np.empty((3, 3))
+        judged, wider = seen.innovation.copy(), np.empty((3, 3))
         for a in range(m):
             for b in range(m):
                 wider[a, b] = spread[a, b]
@@ -143,8 +142,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
             gnss_error.with_whole_error(state, source, values, params, judged, wider)
         if whiten(wider, judged, learnt, m, whitened):
             _judge(state, source, whitened, m, same, t_ns, lasting, params)
-            if model == GNSS_POSITION and cholesky(wider, learnt, 1.0, m, lower):
-                rivals.weigh_consistency(state, source, whitened, lower)
+            if model == GNSS_POSITION:
+                rivals.weigh_consistency(state, source, whitened, wider, learnt)
         if model == GNSS_VELOCITY:
             rivals.lead_off(state, source, seen.innovation, elapsed, params)
         source_health.learn(memory, seen.innovation, given, spread, m, elapsed)
@@ -171,7 +170,8 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if trusted and heard and not doubtful:
         rivals.watch_inertial(state, seen, weight, spread, fits)
     if state.stamps[ALIVE] > 0:
-        rivals.decide(state, rests(state, params) and _moves(state, params), params)
+        suspected = int(params.model_parameters[int(state.stamps[SUSPECT]), COMPANION])
+        rivals.decide(state, disputed(state, suspected, params), params)
     if not fused and int(parameter[RESETS]) == HEIGHT_OFFSET_ERROR.start and memory[BIASED] > source_health.DISTRUST:
         _reset_offset(state, seen)  # a barometer that is off by a constant has another offset now: weather, a window
         source_health.begin(memory)
@@ -193,13 +193,6 @@ def fuse_measurement(state: FilterState, row: Row, params: Parameters) -> bool: 
     if model == WHEEL_SPEED and not fused:
         source_health.note_rejected(memory, values[wheel_speed.SPEED], seen.innovation[0])
     return fused
-
-
-@compiled
-def _moves(state: FilterState, params: Parameters) -> bool:
-    """Whether the suspected receiver says that the vehicle moves."""
-    velocity = int(params.model_parameters[int(state.stamps[SUSPECT]), COMPANION])
-    return velocity >= 0 and state.memory[velocity, LOWEST_SPEED] > 0.0
 
 
 @compiled

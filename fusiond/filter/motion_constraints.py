@@ -11,7 +11,7 @@ from fusiond.filter.measurement_update import project, update_projected
 from fusiond.filter.observations import non_holonomic, zero_rotation, zero_velocity
 from fusiond.filter.observations.model import LEVER_ARM_B, Observation, mat_eb, with_rate_noise
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import is_stuck, is_trusted
+from fusiond.filter.source_health import is_stuck
 from fusiond.filter.state import (
     ALIVE,
     ATTITUDE,
@@ -39,6 +39,7 @@ from fusiond.filter.state import (
     TURNED_AT_REST,
     FilterState,
     T,
+    variance_about,
 )
 from fusiond.maths.portable import exp, square
 from fusiond.maths.rotation import times
@@ -101,8 +102,7 @@ def rests(state: FilterState, params: Parameters) -> bool:
     """Whether every wheel that was heard lately, and is trusted, is at rest, and one was."""
     heard = False
     for i in params.wheels:
-        fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS
-        if fresh and is_trusted(state.memory[i]):
+        if rivals.speaks(state, i):
             heard = True
             if not abs(state.memory[i, LAST_SPEED]) <= params.still_wheel:
                 return False
@@ -115,8 +115,7 @@ def turn_shown(state: FilterState, params: Parameters) -> float:
     forward, the others backward."""
     fastest, left, right = 0.0, math.inf, -math.inf
     for i in params.wheels:
-        fresh = state.stamps[T] - state.source_stamps[i, T_LAST] <= rivals.WHEEL_FRESH_NS
-        if fresh and is_trusted(state.memory[i]):
+        if rivals.speaks(state, i):
             side = params.model_parameters[i, LEVER_ARM_B.start + 1]
             fastest, left, right = max(fastest, abs(state.memory[i, LAST_SPEED])), min(left, side), max(right, side)
     return 2 * fastest / (right - left) if right > left else 0.0
@@ -142,10 +141,7 @@ def doubt_turn(state: FilterState, rate_b: Vector3, dt: float, params: Parameter
     if turned <= doubted:
         return
     state.auxiliary[DOUBTED_AT_REST] = turned
-    variance = 0.0
-    for i in range(3):
-        for j in range(3):
-            variance += down_e[i] * state.covariance[ATTITUDE.start + i, ATTITUDE.start + j] * down_e[j]
+    variance = variance_about(state, down_e[0], down_e[1], down_e[2])
     missing = min(square(turned) - variance, square(turned) - square(doubted))
     if missing > 0:
         for i in range(3):

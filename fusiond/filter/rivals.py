@@ -21,7 +21,16 @@ from fusiond.filter.measurement_update import cholesky, difference, inject, proj
 from fusiond.filter.observations import GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED
 from fusiond.filter.observations.model import COMPANION, Observation
 from fusiond.filter.parameters import Parameters
-from fusiond.filter.source_health import MAX_SQUARE, OUTLIER_VARIANCE, OUTLIERS, begin, distrust, is_trusted, odds_of_bias
+from fusiond.filter.source_health import (
+    MAX_SQUARE,
+    OUTAGE_NS,
+    OUTLIER_VARIANCE,
+    OUTLIERS,
+    begin,
+    distrust,
+    is_trusted,
+    odds_of_bias,
+)
 from fusiond.filter.state import (
     ACCEL_BIAS,
     ALIVE,
@@ -71,7 +80,6 @@ LIE_RATE = 0.03  # rad/s, by which its gyro bias may be another now
 LIE_SPEED = 0.05  # m/s, by which the velocity may be off
 LIE_FORCE = 0.3  # m/s^2, by which its accelerometer bias may be another now
 WHEEL_FRESH_NS = SECOND // 2  # a wheel silent for longer says nothing
-VELOCITY_FRESH_NS = 10 * SECOND  # nor does a receiver's velocity
 FRESH = 0.05  # doubt above which a lie of the inertial sensor is fresh
 FIRST = 0.1  # of these variances, that a lie has for certain
 LARGER = 0.3  # chance that a lie is larger than that
@@ -215,11 +223,17 @@ def fit_lie(  # noqa: PLR0912 - loops
 
 
 @compiled
+def speaks(state: FilterState, wheel: int) -> bool:
+    """Whether a wheel, by its source, was heard lately and is trusted."""
+    return state.stamps[T] - state.source_stamps[wheel, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[wheel])
+
+
+@compiled
 def wheels_contradict(state: FilterState, params: Parameters) -> bool:
     """Whether most of the wheels that were heard lately contradict the main state: then it is not one of them that lies."""
     heard = against = 0
     for i in params.wheels:
-        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[i]):
+        if speaks(state, i):
             heard += 1
             if state.memory[i, LAST_RATIO] > 1:
                 against += 1
@@ -232,8 +246,8 @@ def may_lie(state: FilterState, receiver: int, params: Parameters) -> bool:
     true carrier phases, and just an inertial sensor contradicts it; any trusted wheel that was heard lately is a witness."""
     if state.memory[receiver, FIX_TYPE] != FIX_FIXED:
         return True
-    for i in params.wheels:
-        if state.stamps[T] - state.source_stamps[i, T_LAST] <= WHEEL_FRESH_NS and is_trusted(state.memory[i]):
+    for i in params.wheels:  # noqa: SIM110 - a loop, for the kernel
+        if speaks(state, i):
             return True
     return False
 
@@ -330,15 +344,17 @@ def lead_off(state: FilterState, source: int, innovation: Vector3, elapsed: floa
 
 
 @compiled
-def weigh_consistency(state: FilterState, source: int, whitened: Vector3, lower: Matrix3) -> None:
-    """Weigh the rival in which a receiver lies by a fix, whose whole error is `whitened` (2,) by L = `lower`: its position
-    must go where its velocity leads. A fix that stays with the state meanwhile speaks for the receiver. Only the newest
-    counts: the errors of fixes are alike."""
+def weigh_consistency(state: FilterState, source: int, whitened: Vector3, spread: Matrix3, variance: Vector3) -> None:
+    """Weigh the rival in which a receiver lies by a fix, whose whole error is `whitened` (2,) by S = `spread` (2, 2) +
+    diag(`variance`): its position must go where its velocity leads. A fix that stays with the state meanwhile speaks for the
+    receiver. Only the newest counts: the errors of fixes are alike."""
     if not state.bank[RECEIVER, 0] > 0 or state.stamps[SUSPECT] != source:
         return
-    led = np.empty(2)
-    led[0] = state.auxiliary[LED_OFF.start] / lower[0, 0]
-    led[1] = (state.auxiliary[LED_OFF.start + 1] - lower[1, 0] * led[0]) / lower[1, 1]
+    off, led = np.empty(3), np.empty(3)
+    for i in range(2):
+        off[i] = state.auxiliary[LED_OFF.start + i]
+    if not whiten(spread, off, variance, 2, led):
+        return
     gained = 0.0
     for i in range(2):
         gained += led[i] * (2 * whitened[i] - led[i]) / 2
@@ -353,7 +369,7 @@ def fits_again(state: FilterState, source: int, whitened: Vector3, m: int, param
     what a good one does on average. It must not be said of a receiver whose velocity is heard and still lies: a lie begins
     small."""
     companion = int(params.model_parameters[source, COMPANION])
-    silent = companion < 0 or state.stamps[T] - state.source_stamps[companion, T_LAST] > VELOCITY_FRESH_NS
+    silent = companion < 0 or state.stamps[T] - state.source_stamps[companion, T_LAST] > OUTAGE_NS
     if not silent and state.memory[companion, EXCLUDED] != 0:
         return False
     distance = 0.0

@@ -39,6 +39,7 @@ from fusiond.filter.state import (
 from fusiond.maths.portable import exp
 from fusiond.maths.typed import Array, Matrix3, Stamps, Vector, Vector3, compiled
 
+OUTAGE_NS = 10_000_000_000  # a source that was silent for longer is new when it returns, for as long
 JUDGE_NS = 50_000_000  # samples closer than this share their error
 MEAN_STATUS_TIME = 20.0  # s: how long a source keeps its status
 PRIOR = (0.997, 0.001, 0.001, 0.001)  # nominal, noisy, biased, frozen: what it becomes then

@@ -283,6 +283,16 @@ def is_sound(state: FilterState) -> bool:
 
 
 @compiled
+def variance_about(state: FilterState, x: float, y: float, z: float) -> float:
+    """Variance of the attitude's rotation about an earth-fixed axis (x, y, z) of length 1 [rad^2]."""
+    p, phi = state.covariance, ATTITUDE.start
+    turned = np.empty(3)
+    for a in range(3):
+        turned[a] = p[phi + a, phi] * x + p[phi + a, phi + 1] * y + p[phi + a, phi + 2] * z
+    return x * turned[0] + y * turned[1] + z * turned[2]
+
+
+@compiled
 def count_reset(state: FilterState, reason: int) -> None:
     """Count a reset of the state, and keep its ResetReason."""
     state.stamps[RESETS] += 1

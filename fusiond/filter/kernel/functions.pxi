@@ -772,23 +772,12 @@ cdef void heading_bank_collapse_if_close(State* state, Parameters* params) noexc
     for i in range(13):
         if (state.bank[(i) * BLOCK + 0] > 0):
             hypothesis = hypothesis_of(state, i)
-            own = heading_bank__variance_along(&hypothesis, down[0], down[1], down[2])
+            own = state_variance_about(&hypothesis, down[0], down[1], down[2])
             spread += (state.bank[(i) * BLOCK + 0] * (own + ((turns[i] - mean) * (turns[i] - mean))))
             if (fabs(turns[i]) > 0.5235987755982988):
                 doubt += state.bank[(i) * BLOCK + 0]
     if ((spread <= params.heading_variance) and (doubt <= 0.0001)):
         heading_bank__collapse(state, best, errors)
-
-cdef double heading_bank__variance_along(State* hypothesis, double x, double y, double z) noexcept nogil:
-    cdef double* p
-    cdef int64_t phi
-    cdef double turned[3]
-    cdef int64_t a
-    p = hypothesis.covariance
-    phi = 6
-    for a in range(3):
-        turned[a] = (((p[((phi + a)) * n + phi] * x) + (p[((phi + a)) * n + (phi + 1)] * y)) + (p[((phi + a)) * n + (phi + 2)] * z))
-    return (((x * turned[0]) + (y * turned[1])) + (z * turned[2]))
 
 cdef void heading_bank__collapse(State* state, int64_t best, double* errors) noexcept nogil:
     cdef double* p
@@ -1274,7 +1263,6 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double judged[3]
     cdef int _i
     cdef double wider[3 * 3]
-    cdef double lower[3 * 3]
     cdef int64_t b
     cdef bint trusted
     cdef double noisy
@@ -1290,6 +1278,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     cdef double gained
     cdef double unread
     cdef double main
+    cdef int64_t suspected
     cdef int64_t slot
     cdef State rival
     source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
@@ -1341,8 +1330,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
             gnss_error_with_whole_error(state, source, values, params, judged, wider)
         if measurement_update_whiten(wider, judged, learnt, m, whitened):
             measurement__judge(state, source, whitened, m, same, t_ns, lasting, params)
-            if ((model == 0) and measurement_update_cholesky(wider, learnt, 1.0, m, lower)):
-                rivals_weigh_consistency(state, source, whitened, lower)
+            if (model == 0):
+                rivals_weigh_consistency(state, source, whitened, wider, learnt)
         if (model == 1):
             rivals_lead_off(state, source, seen.innovation, elapsed, params)
         source_health_learn(memory, seen.innovation, given, spread, m, elapsed)
@@ -1373,7 +1362,8 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     if (trusted and heard and (not doubtful)):
         rivals_watch_inertial(state, &seen, weight, spread, fits)
     if (state.stamps[22] > 0):
-        rivals_decide(state, (motion_constraints_rests(state, params) and measurement__moves(state, params)), params)
+        suspected = (<int64_t>(params.model_parameters[((<int64_t>(state.stamps[23]))) * PARAMETERS + 11]))
+        rivals_decide(state, motion_constraints_disputed(state, suspected, params), params)
     if ((not fused) and ((<int64_t>(parameter[13])) == 29) and (memory[6] > 0.5)):
         measurement__reset_offset(state, &seen)
         source_health_begin(memory)
@@ -1395,11 +1385,6 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
     if ((model == 2) and (not fused)):
         source_health_note_rejected(memory, values[0], seen.innovation[0])
     return fused
-
-cdef bint measurement__moves(State* state, Parameters* params) noexcept nogil:
-    cdef int64_t velocity
-    velocity = (<int64_t>(params.model_parameters[((<int64_t>(state.stamps[23]))) * PARAMETERS + 11]))
-    return ((velocity >= 0) and (state.memory[(velocity) * MEMORY_SIZE + 1] > 0.0))
 
 cdef void measurement__judge(State* state, int64_t source, double* whitened, int64_t m, bint same, int64_t t_ns, double correlation, Parameters* params) noexcept nogil:
     cdef double* memory
@@ -1960,12 +1945,10 @@ cdef bint motion_constraints_rests(State* state, Parameters* params) noexcept no
     cdef bint heard
     cdef int64_t i
     cdef int64_t _k1
-    cdef bint fresh
     heard = False
     for _k1 in range(params.wheels_count):
         i = params.wheels[_k1]
-        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000)
-        if (fresh and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+        if rivals_speaks(state, i):
             heard = True
             if (not (fabs(state.memory[(i) * MEMORY_SIZE + 0]) <= params.still_wheel)):
                 return False
@@ -1977,14 +1960,12 @@ cdef double motion_constraints_turn_shown(State* state, Parameters* params) noex
     cdef double right
     cdef int64_t i
     cdef int64_t _k1
-    cdef bint fresh
     cdef double side
     cdef double _t2
     fastest, left, right = 0.0, INFINITY, (-INFINITY)
     for _k1 in range(params.wheels_count):
         i = params.wheels[_k1]
-        fresh = ((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000)
-        if (fresh and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+        if rivals_speaks(state, i):
             side = params.model_parameters[(i) * PARAMETERS + (0 + 1)]
             _t2 = fabs(state.memory[(i) * MEMORY_SIZE + 0])
             fastest, left, right = (_t2 if _t2 > fastest else fastest), (side if side < left else left), (side if side > right else right)
@@ -2005,10 +1986,10 @@ cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt,
     cdef double turned
     cdef double doubted
     cdef double variance
-    cdef int64_t j
     cdef double _t6
     cdef double _t7
     cdef double missing
+    cdef int64_t j
     if ((state.stamps[10] != 2) or (not motion_constraints_rests(state, params)) or motion_constraints_carried(state, 0.0, params)):
         _t1 = 0.0
         state.auxiliary[45] = _t1
@@ -2031,10 +2012,7 @@ cdef void motion_constraints_doubt_turn(State* state, double* rate_b, double dt,
     if (turned <= doubted):
         return
     state.auxiliary[46] = turned
-    variance = 0.0
-    for i in range(3):
-        for j in range(3):
-            variance += ((down_e[i] * state.covariance[((6 + i)) * n + (6 + j)]) * down_e[j])
+    variance = state_variance_about(state, down_e[0], down_e[1], down_e[2])
     _t6 = (portable_square(turned) - variance)
     _t7 = (portable_square(turned) - portable_square(doubted))
     missing = (_t7 if _t7 < _t6 else _t6)
@@ -2857,6 +2835,9 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
     measurement_update_project(rival, seen, across, spread)
     return 0.3
 
+cdef bint rivals_speaks(State* state, int64_t wheel) noexcept nogil:
+    return (((state.stamps[0] - state.source_stamps[(wheel) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (wheel) * MEMORY_SIZE))
+
 cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept nogil:
     cdef int64_t _t1
     cdef int64_t heard
@@ -2868,7 +2849,7 @@ cdef bint rivals_wheels_contradict(State* state, Parameters* params) noexcept no
     against = _t1
     for _k2 in range(params.wheels_count):
         i = params.wheels[_k2]
-        if (((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+        if rivals_speaks(state, i):
             heard += 1
             if (state.memory[(i) * MEMORY_SIZE + 2] > 1):
                 against += 1
@@ -2881,7 +2862,7 @@ cdef bint rivals_may_lie(State* state, int64_t receiver, Parameters* params) noe
         return True
     for _k1 in range(params.wheels_count):
         i = params.wheels[_k1]
-        if (((state.stamps[0] - state.source_stamps[(i) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (i) * MEMORY_SIZE)):
+        if rivals_speaks(state, i):
             return True
     return False
 
@@ -2972,17 +2953,20 @@ cdef void rivals_lead_off(State* state, int64_t source, double* innovation, doub
         for i in range(2):
             state.auxiliary[(42 + i)] += (innovation[i] * elapsed)
 
-cdef void rivals_weigh_consistency(State* state, int64_t source, double* whitened, double* lower) noexcept nogil:
-    cdef double led[2]
-    cdef double gained
+cdef void rivals_weigh_consistency(State* state, int64_t source, double* whitened, double* spread, double* variance) noexcept nogil:
+    cdef double off[3]
+    cdef double led[3]
     cdef int64_t i
+    cdef double gained
     cdef double _t1
     cdef double _t2
     cdef double odds
     if ((not (state.bank[(1) * BLOCK + 0] > 0)) or (state.stamps[23] != source)):
         return
-    led[0] = (state.auxiliary[42] / lower[(0) * 3 + 0])
-    led[1] = ((state.auxiliary[(42 + 1)] - (lower[(1) * 3 + 0] * led[0])) / lower[(1) * 3 + 1])
+    for i in range(2):
+        off[i] = state.auxiliary[(42 + i)]
+    if (not measurement_update_whiten(spread, off, variance, 2, led)):
+        return
     gained = 0.0
     for i in range(2):
         gained += ((led[i] * ((2 * whitened[i]) - led[i])) / 2)
@@ -3462,6 +3446,17 @@ cdef bint state_is_sound(State* state) noexcept nogil:
     for i in range(n):
         total += state.covariance[(i) * n + i]
     return isfinite(total)
+
+cdef double state_variance_about(State* state, double x, double y, double z) noexcept nogil:
+    cdef double* p
+    cdef int64_t phi
+    cdef double turned[3]
+    cdef int64_t a
+    p = state.covariance
+    phi = 6
+    for a in range(3):
+        turned[a] = (((p[((phi + a)) * n + phi] * x) + (p[((phi + a)) * n + (phi + 1)] * y)) + (p[((phi + a)) * n + (phi + 2)] * z))
+    return (((x * turned[0]) + (y * turned[1])) + (z * turned[2]))
 
 cdef void state_count_reset(State* state, int64_t reason) noexcept nogil:
     state.stamps[11] += 1

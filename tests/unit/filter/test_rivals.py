@@ -16,7 +16,7 @@ from fusiond.filter import rivals
 from fusiond.filter.measurement_update import difference, inject
 from fusiond.filter.observations.model import Observation
 from fusiond.filter.parameters import Parameters, make_parameters
-from fusiond.filter.source_health import OUTLIER_VARIANCE, OUTLIERS, PRIOR
+from fusiond.filter.source_health import OUTAGE_NS, OUTLIER_VARIANCE, OUTLIERS, PRIOR
 from fusiond.filter.state import (
     ALIVE,
     BIASED,
@@ -178,7 +178,7 @@ def test_positions_wait_for_a_velocity_that_lies_but_not_for_one_that_is_silent(
     state, near, far = running_state(np.random.default_rng(6)), np.array([1.0, -1.0, 0.0]), np.array([2.0, -1.0, 0.0])
     state.memory[[PLACE, SPEED], EXCLUDED] = 1.0
     assert rivals.fits_again(state, PLACE, near, 2, PARAMS)  # none was ever heard
-    state.source_stamps[SPEED, T_LAST] = state.stamps[T] - rivals.VELOCITY_FRESH_NS
+    state.source_stamps[SPEED, T_LAST] = state.stamps[T] - OUTAGE_NS
     assert not rivals.fits_again(state, PLACE, near, 2, PARAMS)
     state.stamps[T] += 1
     assert rivals.fits_again(state, PLACE, near, 2, PARAMS)
@@ -197,15 +197,15 @@ def test_fixed_ambiguities_are_only_doubted_with_a_witness(fix_type: int, wheel:
 
 def test_a_fix_that_is_not_led_off_speaks_for_its_receiver() -> None:
     """Three sigmas between where the velocity leads and where the fix is: exp(-9 / 2). Only the newest counts."""
-    state, lower = contended(7, (rivals.RECEIVER,)), 0.5 * np.eye(3)
+    state, none, variance = contended(7, (rivals.RECEIVER,)), np.zeros((3, 3)), np.full(3, 0.25)
     begin = float(state.bank[rivals.RECEIVER, 0])
     state.auxiliary[LED_OFF], state.auxiliary[LED_OFF_ODDS] = 0.0, 1.0
     for _ in range(3):
         rivals.lead_off(state, SPEED, np.array([0.5, 0.0, 0.0]), 1.0, PARAMS)
     for _ in range(4):
-        rivals.weigh_consistency(state, PLACE, np.zeros(3), lower)
+        rivals.weigh_consistency(state, PLACE, np.zeros(3), none, variance)
     assert state.bank[rivals.RECEIVER, 0] == pytest.approx(begin * math.exp(-4.5), rel=1e-12)
-    rivals.weigh_consistency(state, PLACE, np.array([3.0, 0.0, 0.0]), lower)  # the position goes along
+    rivals.weigh_consistency(state, PLACE, np.array([3.0, 0.0, 0.0]), none, variance)  # the position goes along
     assert state.bank[rivals.RECEIVER, 0] == pytest.approx(begin, rel=1e-12)
 
 
