@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import resource
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from itertools import pairwise
@@ -41,6 +40,7 @@ from fusiond_adapters.host.bounded_folder import BoundedFolder
 from fusiond_adapters.logs.play import mavlink_records
 from fusiond_adapters.logs.tlog import STAMP
 from fusiond_adapters.mcap import McapFile, McapRecorder, repair
+from tests.helpers.disk import limited_files
 
 DEADLINE = 15.0  # s
 SECOND = 1_000_000_000
@@ -286,17 +286,6 @@ def recording(recorder: McapRecorder) -> Iterator[list[OutputLost]]:
         recorder.outbox.rouse()
         thread.join(DEADLINE)
         assert not thread.is_alive()
-
-
-@contextmanager
-def limited_files(size: int) -> Iterator[None]:
-    """Inside the block no file can grow beyond so many bytes: as good as a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def recorder(tmp_path: Path, **keys: Any) -> McapRecorder:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 
@@ -15,6 +12,7 @@ import pytest
 from fusiond_adapters.host.bounded_folder import BoundedFolder
 from fusiond_adapters.logs import black_box
 from fusiond_adapters.logs.black_box import RETRY_NS, Recorder
+from tests.helpers.disk import limited_files
 
 
 def test_black_box_stays_below_its_limit_and_leaves_other_files_alone(tmp_path: Path) -> None:
@@ -59,17 +57,6 @@ def test_black_box_goes_on_when_there_is_room_again(tmp_path: Path, monkeypatch:
 
 def no_space() -> OSError:
     return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-@contextmanager
-def limited_files(size: int) -> Iterator[None]:
-    """Inside the block no file can grow beyond so many bytes: as good as a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("records", [5, 3000])
