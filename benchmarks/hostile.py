@@ -23,8 +23,8 @@ import sys
 import threading
 import time
 import tty
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Collection
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -257,16 +257,6 @@ def attack(ports: Ports, seconds: float, attacks: Collection[str], seed: int) ->
         print(msgspec.json.encode([attackers.sent, attackers.stolen]).decode())
 
 
-@contextmanager
-def another(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    command = ["nice", "-n", str(-os.nice(0)), sys.executable, "-m", "benchmarks.hostile", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
-        try:
-            yield made
-        finally:
-            made.kill()
-
-
 class Slcan:
     """A serial CAN adapter: good lines, and with `rate_hz` garbled ones."""
 
@@ -408,7 +398,9 @@ class Arena:
         await asyncio.to_thread(_line, reader)
         names = ",".join(name for name in self.attacks if name not in ("slcan", "stopped", "reloads"))
         options = ("--seconds", self.seconds, "--seed", self.seed, "--attacks", names)
-        attackers = stack.enter_context(another("--ports", msgspec.json.encode(self.ports).decode(), *options))
+        attackers = stack.enter_context(
+            process("--ports", msgspec.json.encode(self.ports).decode(), *options, module="benchmarks.hostile")
+        )
         output = asyncio.create_task(asyncio.to_thread(attackers.communicate))
         begin = time.monotonic()
         while not output.done():

@@ -322,8 +322,9 @@ def set_timer_slack(slack_ns: int) -> None:
 
 
 @contextmanager
-def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    command = ["nice", "-n", str(-os.nice(0)), sys.executable, "-m", "benchmarks.latency", *map(str, arguments)]
+def process(*arguments: object, module: str = "benchmarks.latency") -> Iterator[subprocess.Popen[str]]:
+    """A module in a process of its own, of normal priority, whose output can be read; it is killed at the end."""
+    command = ["nice", "-n", str(-os.nice(0)), sys.executable, "-m", module, *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
         try:
             yield made
