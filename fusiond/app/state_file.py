@@ -20,6 +20,7 @@ from fusiond.filter.stored_state import (
 )
 from fusiond.messages.types import OutputHealth
 from fusiond.ports.outputs import KeptFrame
+from fusiond_adapters.host.bounded_folder import sync_folder
 
 MAX_BYTES = 1_000_000  # a larger file was not written by fusiond
 
@@ -105,8 +106,4 @@ class StateFile:
         except OSError:
             fresh.unlink(missing_ok=True)
             raise
-        folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(folder)  # so that the new name survives a power failure
-        finally:
-            os.close(folder)
+        sync_folder(self._path.parent)
