@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from abc import ABC, abstractmethod
 from collections import Counter
 from contextlib import suppress
 from threading import Thread
@@ -15,12 +16,12 @@ from threading import Thread
 from fusiond_adapters.host.budget import Budget
 
 MAX_HEAD = 8192  # bytes of a request
-ABANDONED_MS = 30_000  # a peer that answers nothing for so long is gone
+ABANDONED_MS = 30_000  # a peer that has acknowledged nothing for this long is given up
 ANSWER = "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {size}\r\nConnection: close\r\n\r\n"
 PLAIN = "text/plain; charset=utf-8"
 
 
-class LimitedServer:
+class LimitedServer(ABC):
     """Calls `attend` for each connection, at most `connections` at once, in a thread of its own from `start` to `stop`.
 
     Raises OSError if the address cannot be listened on.
@@ -38,10 +39,10 @@ class LimitedServer:
         self._fault: Exception | None = None
         self._thread = Thread(target=self._run, name=name)
 
+    @abstractmethod
     async def attend(self, connection: socket.socket) -> None:
         """Serve a connection, which is closed afterwards. TimeoutError and OSError are counted; what else it raises ends the
         server."""
-        raise NotImplementedError
 
     def start(self) -> None:
         """Serve until `stop`. Raises RuntimeError if no thread can be started."""
