@@ -87,6 +87,7 @@ def session_config(section: ZenohSection, directory: str | Path = ".", *, patien
         ("connect/endpoints", [endpoint(one) for one in section.connect], default.connect),
         ("scouting/multicast/enabled", section.multicast_scouting, default.multicast_scouting),
         ("scouting/gossip/enabled", False, False),
+        ("transport/shared_memory/enabled", False, False),  # 16 MB for messages over 3 kB; a state has 1
         ("connect/retry", RETRY, RETRY),
         ("transport/unicast/max_sessions", SESSIONS, SESSIONS),
         ("transport/link/tx/queue/size/real_time", QUEUED, QUEUED),
