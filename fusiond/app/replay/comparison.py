@@ -28,12 +28,17 @@ class Errors(NamedTuple):
     height_m: float
     velocity_mps: float  # horizontal, magnitude
     yaw_deg: float  # wrapped
-    inside: bool  # the horizontal position error lies in the 95 % ellipse of the published covariance
+    nees: float  # squared horizontal position error in units of the published covariance; infinite if that is singular
     true: TruthSample
 
     @property
     def horizontal_m(self) -> float:
         return math.hypot(self.north_m, self.east_m)
+
+    @property
+    def inside(self) -> bool:
+        """Whether the horizontal position error lies in the 95 % ellipse of the published covariance."""
+        return self.nees <= ELLIPSE_95
 
 
 def errors_of(message: StateMessage, true: TruthSample | None) -> Errors | None:
@@ -49,7 +54,7 @@ def errors_of(message: StateMessage, true: TruthSample | None) -> Errors | None:
         state.height_m - true.height_m,
         math.hypot(vn - true.vn_mps, ve - true.ve_mps),
         wrapped(state.yaw_deg - true.yaw_deg),
-        _mahalanobis2(north, east, state) <= ELLIPSE_95,
+        _mahalanobis2(north, east, state),
         true,
     )
 
@@ -74,6 +79,7 @@ class PositionReport(Struct, frozen=True, kw_only=True):
     rmse_offset_removed_m: float
     end_m: float  # in the last state
     inside_95: float  # share of states inside the 95 % ellipse of the published covariance: 0.95 or more is honest
+    nees: float | None = None  # mean squared error in units of the published covariance: 2 is honest; null: one is singular
 
 
 class HeadingReport(Struct, frozen=True, kw_only=True):
@@ -111,7 +117,7 @@ class Comparison:
     def __init__(self, window: Window | None = None) -> None:
         self._window = window or Window()
         self._north, self._east, self._height, self._heading = Mean(), Mean(), Mean(), Mean()
-        self._speed, self._inside = Mean(), Mean()
+        self._speed, self._inside, self._nees = Mean(), Mean(), Mean()
         self._horizontals = Histogram(POSITION_STEP, POSITION_LIMIT)
         self._speeds = Histogram(SPEED_STEP, SPEED_LIMIT)
         self._headings = Histogram(ANGLE_STEP, ANGLE_LIMIT)
@@ -136,6 +142,7 @@ class Comparison:
         self._height.add(errors.height_m)
         self._speed.add(errors.velocity_mps)
         self._inside.add(float(errors.inside))
+        self._nees.add(errors.nees)
         heading = wrapped(errors.yaw_deg - self._first_yaw)
         self._heading.add(heading)
         self._horizontals.add(errors.horizontal_m)
@@ -160,6 +167,7 @@ class Comparison:
                 rmse_offset_removed_m=math.sqrt(self._north.variance + self._east.variance),
                 end_m=self._last.horizontal_m,
                 inside_95=self._inside.value,
+                nees=self._nees.value if math.isfinite(self._nees.value) else None,
             ),
             height_rmse_m=math.sqrt(self._height.square),
             velocity_rmse_mps=math.sqrt(self._speed.square),

@@ -42,12 +42,12 @@ def test_comparison_gives_numpys_figures(offset_deg: float) -> None:
     n = 400
     north, east = random.normal(0.3, 0.2, n), random.normal(-0.1, 0.1, n)
     height, speed, yaw = random.normal(1.0, 0.5, n), np.abs(random.normal(0, 0.1, n)), random.normal(0, 0.5, n)
-    inside = random.random(n) < 0.9
+    nees = random.chisquare(2, n)
     comparison = Comparison(Window(1.0, 3.0))
     for k in range(n):
         wrapped = (float(yaw[k]) + offset_deg + 180) % 360 - 180
         true = HERE._replace(lat_deg=48.0 + k * 1e-5)
-        errors = Errors(*map(float, (north[k], east[k], height[k], speed[k])), wrapped, bool(inside[k]), true)
+        errors = Errors(*map(float, (north[k], east[k], height[k], speed[k])), wrapped, float(nees[k]), true)
         comparison.add(k * SECOND // 100, errors)
     found = comparison.report()
     assert found is not None
@@ -61,7 +61,8 @@ def test_comparison_gives_numpys_figures(offset_deg: float) -> None:
     assert found.position.p95_m == pytest.approx(np.quantile(horizontal, 0.95, method="inverted_cdf"), abs=6e-4)
     assert found.position.max_m == horizontal.max()
     assert found.position.end_m == horizontal[-1]
-    assert found.position.inside_95 == pytest.approx(inside[here].mean())
+    assert found.position.inside_95 == pytest.approx((nees[here] <= 5.991).mean())
+    assert found.position.nees == pytest.approx(nees[here].mean())
     assert found.height_rmse_m == pytest.approx(np.sqrt(np.mean(height[here] ** 2)))
     assert found.velocity_rmse_mps == pytest.approx(np.sqrt(np.mean(speed[here] ** 2)))
     turned = yaw[here] - yaw[here].mean()
