@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from pathlib import Path
 
 from fusiond.config.schema import MAX_SCALES, Config, calibrated, sensor_tables, wheel_groups
 from fusiond.config.sensor import INPUTS
-from fusiond.config.toml import decode, read_text, refuse
+from fusiond.config.toml import decode, meant, read_text, refuse
 
 
 def load(file: str | Path) -> Config:
@@ -62,9 +61,7 @@ def _reference(config: Config, key: str, table: str, name: str) -> Iterator[tupl
     """A complaint where a key names a table that is not there."""
     known = getattr(config, table)
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        meant = f" (did you mean '{near[0]}'?)" if near else ""
-        yield key, f"there is no [{table}.{name}]{meant}; configured: {', '.join(sorted(known)) or 'none'}"
+        yield key, f"there is no [{table}.{name}]{meant(name, known)}; configured: {', '.join(sorted(known)) or 'none'}"
 
 
 def _contradictions_on_counts(config: Config) -> Iterator[tuple[str, str]]:

@@ -1,12 +1,14 @@
-"""From a TOML file to typed, frozen structs. An error names the file, the line, the key and what is allowed."""
+"""From a TOML file to typed, frozen structs. All errors are told at once: each names file, line, key and what is allowed."""
 
 from __future__ import annotations
 
+import difflib
 import io
 import math
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args, get_origin
 
@@ -16,12 +18,16 @@ from msgspec import Meta, Struct
 from fusiond.errors import UsageError
 
 MAX_BYTES, MAX_LINE = 1 << 18, 2000  # of a file; characters of a line. A dotted key takes time by its length squared
+MAX_COMPLAINTS = 20  # about one file
 INTEGERS = range(-(1 << 63), 1 << 63)  # as TOML has them
+
+MISSING = re.compile(r"missing required field `(\w+)`")
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]+$", description="a name of letters, digits and underscores")]
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Vector = tuple[float, float, float]
+Complaint = tuple[str, str]  # dotted key, what is wrong
 
 
 class ConfigError(UsageError):
@@ -63,18 +69,52 @@ def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
         raise ConfigError(f"{path}: tables or arrays are nested too deeply") from error
     for key in given:
         if key in table:
-            raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: unknown key")
+            raise ConfigError(f"{path}:{line_of(key, text)}: {key}: unknown key")
     refuse(unusable, text, path)
-    try:
-        return msgspec.convert(table | given, kind)
-    except msgspec.ValidationError as error:
-        raise ConfigError(_explain(str(error), table, text, path, kind=kind, given=given)) from error
+    complaints: list[Complaint] = []
+    wrong: set[str] = set()  # what was taken out is not missing
+    while len(complaints) < MAX_COMPLAINTS:
+        try:
+            decoded = msgspec.convert(table | given, kind)
+        except msgspec.ValidationError as error:
+            key, what = _explain(str(error), table, kind=kind, given=given)
+            missing = MISSING.search(str(error))
+            if not (missing and f"{key}.{missing.group(1)}" in wrong):
+                complaints.append((key, what))
+            wrong.add(key)
+            if not _take_out(table, key):
+                break
+        else:
+            refuse(complaints, text, path)
+            return decoded
+    refuse(complaints, text, path)
+    raise AssertionError("a complaint is refused")
 
 
-def refuse(complaints: Iterable[tuple[str, str]], text: str, path: Path) -> None:
-    """Raise ConfigError for the first complaint (dotted key, what is wrong), if there is one."""
-    for key, complaint in complaints:
-        raise ConfigError(f"{path}:{_line_of(key, text)}: {key}: {complaint}")
+def refuse(complaints: Iterable[Complaint], text: str, path: Path) -> None:
+    """Raise ConfigError with all complaints, a line for each in the order of the file, if there are any."""
+    lines = [(line_of(key, text), f"{key or 'the file'}: {complaint}") for key, complaint in complaints]
+    if lines:
+        raise ConfigError("\n".join(f"{path}:{number}: {words}" for number, words in sorted(lines, key=itemgetter(0))))
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """A question in brackets, with a space before it, where a wrong name is like a known one; else nothing."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f" (did you mean '{near[0]}'?)" if near else ""
+
+
+def _take_out(table: dict[str, object], key: str) -> bool:
+    """Leave a value out of a table, so that what follows it can be checked. False if it cannot be found."""
+    *path, last = re.findall(r"[^.\[\]]+", key) or [""]
+    here: object = table
+    for part in path:
+        here = here[int(part)] if isinstance(here, list) else here.get(part) if isinstance(here, dict) else None
+    if isinstance(here, dict):
+        return here.pop(last, None) is not None
+    if isinstance(here, list):  # a part of a value: all of it
+        return _take_out(table, key.rpartition("[")[0])
+    return False
 
 
 def _unusable_numbers(value: object, key: str = "") -> Iterator[tuple[str, str]]:
@@ -91,10 +131,8 @@ def _unusable_numbers(value: object, key: str = "") -> Iterator[tuple[str, str]]
         yield key, "must fit into 64 bits"
 
 
-def _explain(
-    message: str, table: dict[str, object], text: str, path: Path, *, kind: type[Section], given: dict[str, object]
-) -> str:
-    """msgspec's complaint, with the file's line, the dotted key and the allowed keys."""
+def _explain(message: str, table: dict[str, object], *, kind: type[Section], given: dict[str, object]) -> Complaint:
+    """msgspec's complaint: the dotted key, and what is wrong with it, with the allowed keys or values."""
     where = re.search(r" - at (?:`key` in )?`\$\.?(.*?)`$", message)
     inside = where.group(1) if where else ""
     what = message[: where.start()] if where else message
@@ -104,12 +142,13 @@ def _explain(
         here = _kind_at(kind, key.split(".") if key else [])
         allowed = sorted(set(here.__struct_fields__) - set(given)) if here else []
         key = f"{key}.{unknown.group(1)}" if key else unknown.group(1)
-        what = f"unknown key; allowed: {', '.join(allowed)}"
-    missing = re.search(r"missing required field `(\w+)`", message)
+        what = f"unknown key{meant(unknown.group(1), allowed)}; allowed: {', '.join(allowed)}"
+    missing = MISSING.search(message)
     if missing:
         what = f"the key '{missing.group(1)}' is missing"
-    if what.startswith("Invalid enum value"):
-        what += f"; allowed: {', '.join(_choices(kind, key))}"
+    if wrong := re.match(r"Invalid enum value '?(.*?)'?$", what):
+        choices = _choices(kind, key)
+        what += f"{meant(wrong.group(1), choices)}; allowed: {', '.join(choices)}"
     if " at `key` in " in message:
         entries = table[inside]
         assert isinstance(entries, dict)
@@ -117,7 +156,7 @@ def _explain(
         what = f"must be {_descriptions(Name)[0]}"
     elif "matching regex" in what:
         what = f"must be {_descriptions(_type_of(kind, key))[0]}"
-    return f"{path}:{_line_of(key, text)}: {key or 'the file'}: {what}"
+    return key, what
 
 
 def _choices(kind: type[Section], key: str) -> list[str]:
@@ -184,7 +223,7 @@ def _section_in(hint: object) -> tuple[type[Section] | None, bool]:
     return (found[0], get_origin(hint) is dict) if found else (None, False)
 
 
-def _line_of(key: str, text: str) -> int:
+def line_of(key: str, text: str) -> int:
     """The line of a dotted key, or of the nearest table above it; 1 if neither is in the text."""
     parts = key.split(".")
     table, best, depth = "", 1, 0
@@ -197,7 +236,7 @@ def _line_of(key: str, text: str) -> int:
                 counts[table] = counts.get(table, -1) + 1
                 table = f"{table}[{counts[table]}]"
             shared = len([1 for a, b in zip(table.split("."), parts, strict=False) if a == b])
-            if key.startswith(table) and shared > depth:
+            if (key.startswith(table) or table.startswith(f"{key}.")) and shared > depth:
                 best, depth = number, shared
             continue
         assigned = re.match(r"\s*([\w.\-]+)\s*=", line)

@@ -71,11 +71,39 @@ def test_a_choice_lists_what_may_be_chosen(text: str, key: str, bad: str, allowe
 
 
 def test_unknown_keys_list_the_known_ones() -> None:
-    check(BASE + "[filter]\nhorizon = 1", 5, "filter.horizon", "unknown key; allowed: ", "gate_probability", "horizon_s")
-    check(BASE + "[filtre]\nhorizon_s = 1", 4, "filtre", "unknown key; allowed: ", "filter", "vehicle")
+    known = "unknown key (did you mean 'horizon_s'?); allowed: "
+    check(BASE + "[filter]\nhorizon = 1", 5, "filter.horizon", known, "gate_probability", "horizon_s")
+    check(BASE + "[filtre]\nhorizon_s = 1", 4, "filtre", "unknown key (did you mean 'filter'?); allowed: ", "vehicle")
+    check(BASE + "[wheels.left]\nx = 1", 4, "wheels", "unknown key (did you mean 'wheel'?); allowed: ")
+    check(BASE + "[filter]\nxyzzy = 1", 5, "filter.xyzzy", "unknown key; allowed: ")
     check(BASE + GNSS + "lever_arm = [0, 0, 0]", 6, "gnss.gps0.lever_arm", "unknown key", "lever_arm_m")
     check("directory = 'x'\n" + BASE, 1, "directory", "unknown key")
     assert "directory" not in complaint(BASE + "[filtre]").split("allowed")[1]
+
+
+def test_all_errors_are_told_at_once_in_the_order_of_the_file() -> None:
+    text = BASE.replace('link = "autopilot"', 'link = 3') + (
+        "rotation_deg = [1, 2]\n[filter]\nhorizon_s = -1\nimu_gap = 1\n[publish]\nencoding = 'jsn'\n[wheel.w]\nunit = 'kmh'\n"
+    )
+    lines = [line.removeprefix(f"{CAR}:").split(": ")[:2] for line in complaint(text).splitlines()]
+    assert lines == [
+        ["3", "imu.imu0.link"],
+        ["4", "imu.imu0.rotation_deg"],
+        ["6", "filter.horizon_s"],
+        ["7", "filter.imu_gap"],
+        ["9", "publish.encoding"],
+        ["11", "wheel.w.unit"],
+    ]
+
+
+def test_contradictions_are_told_at_once() -> None:
+    wheels = "".join(f"[wheel.{name}]\nbus = 'c'\nmessage = 'm'\nsignal = '{name}'\nscale = 0\n" for name in "ab")
+    lines = complaint(BASE + wheels).splitlines()
+    assert [line.split(": ")[1] for line in lines] == ["wheel.a.bus", "wheel.a.scale", "wheel.b.bus", "wheel.b.scale"]
+
+
+def test_the_errors_of_a_hopeless_file_end() -> None:
+    assert len(complaint(BASE + "".join(f"[x{i}]\n" for i in range(1000))).splitlines()) == 20
 
 
 def test_missing_keys() -> None:
