@@ -69,6 +69,8 @@ uninstall:
 	rm -rf /opt/fusiond /usr/share/fusiond
 	rm -f /usr/bin/fusiond /usr/lib/systemd/system/fusiond.service /usr/lib/systemd/system/fusiond@.service
 	rm -f /usr/lib/sysusers.d/fusiond.conf /usr/lib/tmpfiles.d/fusiond.conf /usr/share/man/man1/fusiond.1.gz
+	rm -f /usr/share/bash-completion/completions/fusiond /usr/share/zsh/vendor-completions/_fusiond
+	rm -f /usr/share/fish/vendor_completions.d/fusiond.fish
 	rm -rf /usr/share/doc/fusiond
 	packaging/postrm remove
 

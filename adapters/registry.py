@@ -8,10 +8,12 @@ has `open_log`, see `logs.format`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from typing import Any
 
 from fusiond.config.schema import Config
+from fusiond.config.toml import all_made
 from fusiond.ports.inputs import InputContext, LiveInput
 from fusiond.ports.outputs import LiveOutput, OutputContext
 from fusiond_adapters.logs.format import LogFormat
@@ -47,22 +49,16 @@ def _mavlink_outputs(config: Config) -> set[str | None]:
 
 def make_inputs(config: Config, context: InputContext) -> dict[str, LiveInput[Any]]:
     """The inputs of a configuration, by section and name, such as mavlink.fc. Raises ConfigError."""
-    made: dict[str, LiveInput[Any]] = {}
-    for section, module in INPUTS.items():
-        if getattr(config, section):
-            inputs: Sequence[LiveInput[Any]] = _make(module, config, context)
-            made |= {f"{section}.{one.name}": one for one in inputs}
-    return made
+    sections = [section for section in INPUTS if getattr(config, section)]
+    made: list[Sequence[LiveInput[Any]]] = all_made(partial(_make, INPUTS[section], config, context) for section in sections)
+    return {f"{section}.{one.name}": one for section, inputs in zip(sections, made, strict=True) for one in inputs}
 
 
 def make_outputs(config: Config, context: OutputContext) -> dict[str, LiveOutput]:
     """The outputs of a configuration, by name. Raises ConfigError, also where an extra is missing."""
-    made: dict[str, LiveOutput] = {}
-    for module, wanted in OUTPUTS.items():
-        if wanted(config):
-            outputs: Sequence[LiveOutput] = _make(module, config, context)
-            made |= {one.name: one for one in outputs}
-    return made
+    wanted = (module for module, is_wanted in OUTPUTS.items() if is_wanted(config))
+    made: list[Sequence[LiveOutput]] = all_made(partial(_make, module, config, context) for module in wanted)
+    return {one.name: one for outputs in made for one in outputs}
 
 
 def _make(module: str, *arguments: object) -> Any:

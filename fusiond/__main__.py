@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from fusiond import __version__
+from fusiond.app.colours import painted
 from fusiond.app.commands import COMMANDS, EXIT_CODES, interrupts_end_at_once
 from fusiond.errors import UnusableError, UsageError
 
@@ -31,17 +32,18 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         if name == command:
             module = import_module(f"fusiond.app.commands.{name}")
             module.fill(one)
-            one.set_defaults(run=module.run)
+            one.set_defaults(run=module.run, grammar=parser)
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code. A wrong command line ends with SystemExit(2), as argparse does."""
+    """Run one command; returns the exit code, which the command may have chosen. A wrong command line ends with
+    SystemExit(2), as argparse does."""
     words = sys.argv[1:] if argv is None else argv
     try:
         with interrupts_end_at_once():  # it imports the command
             arguments = parser(words[0] if words else None).parse_args(words)
-        arguments.run(arguments)
+        status: int | None = arguments.run(arguments)
         sys.stdout.flush()
     except UsageError as error:
         return _failed(str(error), USAGE)
@@ -54,11 +56,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(f"{error.filename or 'input or output'}: {error.strerror or error}", UNUSABLE)
     except KeyboardInterrupt:
         return _failed("interrupted", INTERRUPTED)
-    return SUCCESS
+    return status or SUCCESS
 
 
 def _failed(message: str, code: int) -> int:
-    print(f"fusiond: {message}", file=sys.stderr)
+    print(painted(f"fusiond: {message}", "red", sys.stderr), file=sys.stderr)
     return code
 
 

@@ -53,5 +53,8 @@ install -Dm644 -t "$root/usr/share/fusiond/examples/zenoh" configs/zenoh/*
 install -dm755 "$root/usr/bin" "$root/usr/share/man/man1" "$root/usr/share/doc/fusiond"
 ln -sfn /opt/fusiond/bin/fusiond "$root/usr/bin/fusiond"
 "$home/bin/python" packaging/man_page.py | gzip -9n > "$root/usr/share/man/man1/fusiond.1.gz"
+"$home/bin/python" -m fusiond completion bash | install -Dm644 /dev/stdin "$root/usr/share/bash-completion/completions/fusiond"
+"$home/bin/python" -m fusiond completion zsh | install -Dm644 /dev/stdin "$root/usr/share/zsh/vendor-completions/_fusiond"
+"$home/bin/python" -m fusiond completion fish | install -Dm644 /dev/stdin "$root/usr/share/fish/vendor_completions.d/fusiond.fish"
 "$home/bin/python" packaging/licences.py "$site" > "$root/usr/share/doc/fusiond/copyright"
 gzip -9nc CHANGELOG.md > "$root/usr/share/doc/fusiond/changelog.gz"

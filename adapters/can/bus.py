@@ -54,12 +54,13 @@ class CanBus:
         self._settings, self.about = fresh._settings, fresh.about
 
     def prepare(self) -> None:
-        """Load the DBC files. Raises ConfigError if they do not fit."""
+        """Load the DBC files. Raises ConfigError if they do not fit, or the interface is not known."""
         from fusiond_adapters.can.decoder import CanDecoder  # noqa: PLC0415 - see above
-        from fusiond_adapters.can.driver import CanDriver  # noqa: PLC0415
+        from fusiond_adapters.can.driver import CanDriver, check_interface  # noqa: PLC0415
 
         self.decoder = CanDecoder(self._config, self.name)
         self._driver = CanDriver(self.decoder, self.inbox, self._clock)
+        check_interface(self._settings, f"can.{self.name}.interface")
 
     def session(self, stop: Event) -> None:
         """Open the bus, read it until `stop` is set, close it. Raises InputLost."""

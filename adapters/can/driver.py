@@ -17,6 +17,7 @@ from typing import Any
 import can
 
 from fusiond.config.schema import Can
+from fusiond.config.toml import ConfigError, meant
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputLost
 from fusiond.units import nanoseconds
@@ -29,6 +30,14 @@ ID_BITS = 0x1FFFFFFF
 STANDARD_BITS = 0x7FF
 GROUP_BITS, FORMAT_BITS = 0x3FFFF00, 0x3FF0000  # bits of a J1939 id that hold its PGN, without and with a destination
 BIT_RATE_SWITCH, ERROR_STATE = 1, 2  # flags of CAN FD, as candump writes them
+
+
+def check_interface(settings: Can, key: str) -> None:
+    """Raises ConfigError if python-can, with its plugins, has no interface of the configured name."""
+    known = can.VALID_INTERFACES
+    if settings.interface is not None and settings.interface not in known:
+        asked = f"python-can has no interface '{settings.interface}'{meant(settings.interface, known)}"
+        raise ConfigError(f"{key}: {asked}; it has: {', '.join(sorted(known))}")
 
 
 class CanDriver:

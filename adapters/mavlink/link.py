@@ -6,11 +6,12 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from threading import Event, Lock
 from typing import Any
 
 from fusiond.config.schema import Config
-from fusiond.config.toml import ConfigError
+from fusiond.config.toml import ConfigError, all_made
 from fusiond.events import Received
 from fusiond.ports.clock import Clock
 from fusiond.ports.inputs import POLL_S, Inbox, InputContext, InputLost, LiveInput
@@ -163,7 +164,7 @@ def make(config: Config, context: InputContext) -> Sequence[LiveInput[Any]]:
         inbox: Inbox[bytes] = Inbox(config.live.queue_frames, context.wake, message_id)
         return MavlinkLink(config, name, inbox, context.clock, context.is_alive)
 
-    return [link(name) for name in config.mavlink]
+    return all_made(partial(link, name) for name in config.mavlink)
 
 
 def link_of(inputs: Mapping[str, LiveInput[Any]], name: str) -> MavlinkLink:

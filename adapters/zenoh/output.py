@@ -16,10 +16,11 @@ from threading import Event
 import zenoh
 
 from fusiond.config.schema import Config
+from fusiond.config.toml import ConfigError
 from fusiond.messages.types import MESSAGES, HealthMessage, InnovationMessage, Message, StateAtInstant, StateMessage
 from fusiond.ports.outputs import POLL_S, LiveOutput, Outbox, OutputContext, OutputLost
 from fusiond_adapters.zenoh.queries import Answers
-from fusiond_adapters.zenoh.session import LAST_SAMPLE_S, PublishError, ZenohPublisher, open_session
+from fusiond_adapters.zenoh.session import LAST_SAMPLE_S, PublishError, ZenohPublisher, open_session, session_config
 from fusiond_adapters.zenoh.words import in_words
 
 QUEUE_MESSAGES = 1024  # a second of everything, and more
@@ -126,5 +127,9 @@ def _counted(number: int, kind: str) -> str:
 
 
 def make(config: Config, _: OutputContext) -> Sequence[LiveOutput]:
-    """The output of a configuration."""
+    """The output of a configuration. Raises ConfigError for one that Zenoh does not take."""
+    try:
+        session_config(config.zenoh, config.directory)
+    except PublishError as error:
+        raise ConfigError(str(error)) from error
     return [ZenohOutput(config)]

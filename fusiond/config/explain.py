@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import msgspec
+
+from fusiond.config.plausible import implausible
 from fusiond.config.schema import Config
 from fusiond.config.sensor import point_in_words
+from fusiond.config.toml import Section
 from fusiond.events import GnssPosition, Vector3, WheelSpeed
 from fusiond.units import MILLISECOND
 
@@ -44,6 +48,20 @@ def description(config: Config) -> Iterator[str]:
         yield f"Foxglove     ws://{config.foxglove.host}:{config.foxglove.port}"
     if config.prometheus.enabled:
         yield f"Prometheus   http://{config.prometheus.host}:{config.prometheus.port}/metrics"
+
+
+def values(config: Config) -> Iterator[tuple[str, object]]:
+    """Every dotted key with its value, given or default, in the order of the tables."""
+    yield from _values(config, "")
+
+
+def _values(table: Section | dict[str, object], where: str) -> Iterator[tuple[str, object]]:
+    items = table.items() if isinstance(table, dict) else msgspec.structs.asdict(table).items()
+    for key, value in items:
+        if isinstance(value, Section | dict):
+            yield from _values(value, f"{where}{key}.")
+        elif key != "directory":
+            yield f"{where}{key}", value
 
 
 def _start(config: Config) -> str:
@@ -88,14 +106,20 @@ def oddities(config: Config) -> Iterator[str]:
                 f"imu.{name}: ArduPilot's low-pass filters delay its samples, by 56 ms on a Rover with INS_GYRO_FILTER 4:"
                 " set delay_ms, or delay_sigma_ms to learn the delays"
             )
+    yield from _odd_points(config)
+    for key, why in implausible(config):
+        yield f"{key}: {why}"
+    for bus in config.can:
+        if not any(config.sensors(bus=bus)):
+            yield f"can.{bus}: no sensor comes by this bus, so nothing of it will be read"
+
+
+def _odd_points(config: Config) -> Iterator[str]:
     for key, point in _points(config):
         if max(map(abs, point)) > FAR_M:
             yield f"{key}: {point_in_words(point)} is far from the IMU; is it in metres?"
         elif not any(point):
             yield f"{key}: 0 0 0 puts it where the IMU is; is it measured?"
-    for bus in config.can:
-        if not any(config.sensors(bus=bus)):
-            yield f"can.{bus}: no sensor comes by this bus, so nothing of it will be read"
 
 
 def _delays(config: Config) -> Iterator[tuple[str, float]]:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from fusiond.config.schema import MAX_SCALES, Config, calibrated, sensor_tables, wheel_groups
 from fusiond.config.sensor import INPUTS
-from fusiond.config.toml import decode, meant, read_text, refuse
+from fusiond.config.toml import ConfigError, decode, line_of, meant, read_text, refuse
+
+BY_PORT = ("tcp", "udp", "tls", "quic", "ws")  # protocols of Zenoh whose address is HOST:PORT
+PROTOCOLS = (*BY_PORT, "unixsock-stream", "unixpipe", "serial", "vsock")
+MAX_PORT = 65535
 
 
 def load(file: str | Path) -> Config:
@@ -23,11 +28,25 @@ def parse(text: str, path: Path = Path("config.toml")) -> Config:
     return config
 
 
+@contextmanager
+def located(file: str | Path) -> Iterator[None]:
+    """Inside, a ConfigError whose lines begin with a key gets the file and the line of each."""
+    try:
+        yield
+    except ConfigError as error:
+        path = Path(file)
+        text = read_text(path)
+        lines = str(error).splitlines()
+        raise ConfigError("\n".join(f"{path}:{line_of(one.partition(': ')[0], text)}: {one}" for one in lines)) from error
+
+
 def _contradictions(config: Config) -> Iterator[tuple[str, str]]:
     """What types cannot express: references between tables, and combinations that make no sense."""
     yield from _contradictions_on_counts(config)
     yield from _contradictions_on_sensors(config)
     yield from _contradictions_on_can(config)
+    yield from _contradictions_on_endpoints("zenoh", "listen", config.zenoh.listen)
+    yield from _contradictions_on_endpoints("zenoh", "connect", config.zenoh.connect)
     yield from _contradictions_on_ros2(config)
     yield from _contradictions_on_mavlink_out(config)
     yield from _contradictions_on_signing(config)
@@ -80,10 +99,28 @@ def _contradictions_on_signing(config: Config) -> Iterator[tuple[str, str]]:
             yield f"mavlink.{name}", "signing needs both signing_key_file and signing_timestamp_file"
 
 
+def _contradictions_on_endpoints(table: str, key: str, endpoints: list[str]) -> Iterator[tuple[str, str]]:
+    """Endpoints of Zenoh that it would not take, or take and never use."""
+    for place, one in enumerate(endpoints):
+        protocol, slash, address = one.partition("/")
+        if not slash:
+            protocol, address = "tcp", one if ":" in one else f"{one}:0"
+        named, where = f"{table}.{key}[{place}]", address.partition("?")[0].partition("#")[0]
+        host, _, port = where.rpartition(":")
+        if protocol not in PROTOCOLS:
+            near = meant(protocol, PROTOCOLS)
+            yield named, f"'{one}': unknown protocol{near}; known: {', '.join(PROTOCOLS)}"
+        elif not where:
+            yield named, f"'{one}': an endpoint is PROTOCOL/ADDRESS, such as tcp/127.0.0.1:7447"
+        elif protocol in BY_PORT and not (host and port.isdecimal() and int(port) <= MAX_PORT):
+            yield named, f"'{one}': HOST:PORT is needed after the slash, with a port up to {MAX_PORT}"
+
+
 def _contradictions_on_ros2(config: Config) -> Iterator[tuple[str, str]]:
     ros2 = config.ros2
     if not ros2.enabled:
         return
+    yield from _contradictions_on_endpoints("ros2", "connect", ros2.connect)
     if len({ros2.map_frame, ros2.odom_frame, ros2.base_frame}) < 3:
         yield "ros2", "map_frame, odom_frame and base_frame must differ"
     if ros2.origin is not None and not (abs(ros2.origin[0]) <= 90 and abs(ros2.origin[1]) <= 180):

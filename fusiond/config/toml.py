@@ -7,7 +7,7 @@ import io
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args, get_origin
@@ -53,6 +53,7 @@ def read_text(path: Path) -> str:
 
 
 Table = TypeVar("Table", bound=Section)
+Made = TypeVar("Made")
 
 
 def decode(text: str, path: Path, kind: type[Table], **given: object) -> Table:
@@ -96,6 +97,19 @@ def refuse(complaints: Iterable[Complaint], text: str, path: Path) -> None:
     lines = [(line_of(key, text), f"{key or 'the file'}: {complaint}") for key, complaint in complaints]
     if lines:
         raise ConfigError("\n".join(f"{path}:{number}: {words}" for number, words in sorted(lines, key=itemgetter(0))))
+
+
+def all_made(makers: Iterable[Callable[[], Made]]) -> list[Made]:
+    """The results of all calls. Raises ConfigError with the complaints of all that raise it."""
+    made, complaints = [], []
+    for make in makers:
+        try:
+            made.append(make())
+        except ConfigError as error:
+            complaints.append(str(error))
+    if complaints:
+        raise ConfigError("\n".join(complaints))
+    return made
 
 
 def meant(name: str, known: Iterable[str]) -> str:

@@ -18,6 +18,7 @@ COMMANDS = {
     "mount": "estimate the mounting angles of the IMU from logs",
     "simulate": "write the logs of a simulated drive and its truth",
     "demo": "play a bundled drive to a running fusiond, and explain the result",
+    "completion": "print a script that completes fusiond's command line with the tab key",
 }
 
 EXIT_CODES = "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 130 interrupted"

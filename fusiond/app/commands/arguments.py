@@ -10,15 +10,21 @@ from fusiond.errors import UsageError
 SUFFIX = ".toml"  # of a configuration, by which it is known among other files
 
 
-def add_config(parser: argparse.ArgumentParser, about: str = "configuration of the vehicle", *, metavar: str = "C.toml") -> None:
+def add_config(
+    parser: argparse.ArgumentParser, about: str = "configuration of the vehicle", *, metavar: str = "C.toml"
+) -> None:
     """Define the configuration of a command without other files: `C.toml` or `--config C.toml`."""
     parser.add_argument("file", metavar=metavar, nargs="?", help=about)
     parser.add_argument("--config", metavar=metavar, help="the same")
 
 
-def add_config_and_logs(parser: argparse.ArgumentParser, about: str = ".tlog, .log (candump -L), ..., also .gz; or NAME=LOG") -> None:
+def add_config_and_logs(
+    parser: argparse.ArgumentParser, about: str = ".tlog, .log (candump -L), ..., also .gz; or NAME=LOG"
+) -> None:
     """Define the configuration and the logs: `C.toml LOG...` or `--config C.toml LOG...`."""
-    parser.add_argument("logs", metavar="FILE", nargs="+", help=f"C{SUFFIX}, the configuration of the vehicle, and logs: {about}")
+    parser.add_argument(
+        "logs", metavar="FILE", nargs="+", help=f"C{SUFFIX}, the configuration of the vehicle, and logs: {about}"
+    )
     parser.add_argument("--config", metavar="C.toml", help="the configuration, in place of the first FILE")
 
 

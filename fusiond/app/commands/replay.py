@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import argparse
 import logging
+import sys
 from pathlib import Path
 
+from fusiond.app.colours import painted
 from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import positive, rate
+from fusiond.app.commands.arguments import add_config_and_logs, add_verbosity, taken_config
 from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.intervals import parse_interval, parse_withheld
 from fusiond.app.replay.job import Options, replay
-from fusiond.app.replay.summary import text
+from fusiond.app.replay.summary import details, text
 from fusiond.config import load as config
 from fusiond.errors import UsageError
 from fusiond_adapters.host import journal
@@ -21,15 +24,15 @@ Fuse the logs of one drive in their order of receipt, as in a live run: late mea
 time. Prints a summary; the same inputs always give the same files, byte for byte."""
 EXAMPLES = """\
 examples:
-  fusiond replay --config car.toml drive.tlog drive.log --csv track.csv
+  fusiond replay car.toml drive.tlog drive.log --csv track.csv
       fuse a MAVLink log and a candump log into a track
-  fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --window 10-30 --plot errors.png
+  fusiond replay car.toml drive.tlog drive.log --truth truth.csv --window 10-30 --plot errors.png
       compare seconds 10 to 30 with a reference, and draw the errors
-  fusiond replay --config car.toml drive.tlog drive.log --truth truth.csv --withhold gps0:12-22 --window 12-22
+  fusiond replay car.toml drive.tlog drive.log --truth truth.csv --withhold gps0:12-22 --window 12-22
       how large is the error after ten seconds without GNSS?
-  fusiond replay --config car.toml drive.tlog drive.log --speed 1 --publish
+  fusiond replay car.toml drive.tlog drive.log --speed 1 --publish
       publish over Zenoh everything that `fusiond run` would, in real time: run `fusiond top` beside it
-  fusiond replay --config car.toml drive.tlog drive.log --speed 1 --outputs
+  fusiond replay car.toml drive.tlog drive.log --speed 1 --outputs
       test everything that the configuration turns on: ROS 2, Foxglove, Prometheus, ...
 """
 
@@ -38,8 +41,8 @@ def fill(parser: argparse.ArgumentParser) -> None:
     """Define the arguments."""
     parser.description, parser.epilog = ABOUT, f"{EXAMPLES}\n{EXIT_CODES}"
     add = parser.add_argument
-    add("logs", metavar="LOG", nargs="+", help=".tlog, .log (candump -L), .asc, .blf, .trc, ..., also .gz; or NAME=LOG")
-    add("--config", metavar="C.toml", required=True, help="configuration of the vehicle (see `fusiond check`)")
+    add_config_and_logs(parser, ".tlog, .log (candump -L), .asc, .blf, .trc, ..., also .gz; or NAME=LOG")
+    add_verbosity(parser, quiet="print warnings only, and no bar", verbose="print what was read, and the clocks, too")
     add("--csv", metavar="OUT.csv", type=Path, help="write the track: one row per publication")
     add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
     add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
@@ -62,14 +65,15 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
-    loaded = config.load(arguments.config)
+    name = taken_config(arguments)
+    loaded = config.load(name)
     if arguments.window and not arguments.truth:
         raise UsageError("--window limits the comparison with a truth: give --truth as well")
     if arguments.publish or arguments.outputs:
         journal.set_up(logging.WARNING)  # reports the loss of an output
     options = Options(
         config=loaded,
-        config_name=Path(arguments.config).name,
+        config_name=Path(name).name,
         logs=arguments.logs,
         csv=arguments.csv,
         json=arguments.json,
@@ -83,5 +87,14 @@ def run(arguments: argparse.Namespace) -> None:
         speed=arguments.speed,
         publish=arguments.publish,
         outputs=arguments.outputs,
+        bar=not arguments.quiet,
     )
-    print(text(replay(options)))
+    with config.located(name):
+        summary = replay(options)
+    if arguments.quiet:
+        for warning in summary.warnings:
+            print(painted(f"warning: {warning}", "yellow", sys.stderr), file=sys.stderr)
+    else:
+        print(text(summary))
+    if arguments.verbose:
+        print("\n".join(details(summary)))

@@ -8,6 +8,7 @@ import sys
 from types import ModuleType
 
 from fusiond.app.commands import EXIT_CODES, interrupts_end_at_once
+from fusiond.app.commands.arguments import add_config, add_verbosity, log_level, taken_config
 from fusiond.config import load as config
 from fusiond.config.schema import Config
 from fusiond_adapters.host import journal
@@ -20,8 +21,9 @@ running; if anything else has changed, the whole reload is refused, and the log 
 
 def fill(parser: argparse.ArgumentParser) -> None:
     """Define the arguments."""
-    parser.description, parser.epilog = ABOUT, f"example:\n  fusiond run --config car.toml\n\n{EXIT_CODES}"
-    parser.add_argument("--config", metavar="C.toml", required=True, help="configuration of the vehicle")
+    parser.description, parser.epilog = ABOUT, f"example:\n  fusiond run car.toml\n\n{EXIT_CODES}"
+    add_config(parser)
+    add_verbosity(parser, quiet="log warnings and errors only", verbose="log the libraries and the status too")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -31,6 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    name = taken_config(arguments)
     gc.disable()  # imported modules never become garbage: collecting would take a tenth of the start
     asyncio = _asyncio()
     import numpy  # noqa: F401, PLC0415 - not from a deep call stack, where Python maps and unmaps its stack at every call
@@ -40,10 +43,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
     gc.freeze()
     gc.enable()
-    journal.set_up()
+    journal.set_up(log_level(arguments))
 
     def load() -> Config:
-        return config.load(arguments.config)
+        return config.load(name)
 
     asyncio.run(serve(Daemon(load(), load)))
 

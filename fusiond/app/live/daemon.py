@@ -186,6 +186,7 @@ class Daemon:
         if now_s >= self._next_report_s:
             self._next_report_s = now_s + REPORT_S
             self._report_losses()
+            log.debug("%s", self.status())
         self._quiet.after_step(self.health)
 
     # --- The stored state

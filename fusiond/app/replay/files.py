@@ -86,6 +86,13 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
             raise OutputError(f"{path}: cannot be written: there is no folder {path.parent}")
 
 
+def check_suffix(option: str, path: Path | None, suffix: str) -> None:
+    """Raises UsageError where a file has not the suffix of what is written into it."""
+    if path is not None and path.suffix.lower() != suffix:
+        kind = suffix.removeprefix(".").upper()
+        raise UsageError(f"{option} {path}: what is written is {kind}; give a name that ends in {suffix}")
+
+
 def csv_file(path: Path, stack: ExitStack) -> Callable[[StateMessage, Errors | None], None]:
     """Open a track until the stack closes; returns a function that writes a line. Raises OutputError."""
     with delivering(path):

@@ -14,6 +14,7 @@ from fusiond.app.progress import shown
 from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.files import (
     check_outputs,
+    check_suffix,
     csv_file,
     delivering,
     mcap_file,
@@ -54,6 +55,7 @@ class Options:
     speed: float | None = None  # default: as fast as possible
     publish: bool = False  # over Zenoh
     outputs: bool = False  # to every output that the configuration turns on
+    bar: bool = True  # draw a progress bar, on a terminal
     share: Callable[[int], float] | None = None  # part done by the time passed [ns], for the bar; default: bytes read
 
 
@@ -88,7 +90,7 @@ def replay(options: Options) -> Summary:
         else:
             run = Replay(config, task)
         share = options.share or (lambda _: logs.bytes_read / logs.bytes_total)
-        run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr))
+        run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr) if options.bar else logs)
     summary = _summary(options, run, logs, attached_warnings)
     if options.json:
         with delivering(options.json):
@@ -104,6 +106,8 @@ def replay(options: Options) -> Summary:
 
 def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
     """Open the files of the ticks. A file that cannot be written is detected before the work begins."""
+    check_suffix("--plot", options.plot, ".png")
+    check_suffix("--mcap", options.mcap, ".mcap")
     outputs = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
     inputs = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
     check_outputs(outputs, inputs)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 
+GROWTH = 0.01  # of the width of a bin beyond the limit, as a share of its value
+
 
 class Histogram:
-    """Counts in bins of equal width up to a limit on either side of zero; larger values go into the last bins.
+    """Counts in bins of equal width up to a limit on either side of zero; beyond it, in bins that grow with the value.
 
-    Quantiles are the middles of bins, so accurate to half a width; minimum and maximum are exact.
+    Quantiles are the middles of bins, so accurate to half a width, and beyond the limit to half a per cent; minimum and
+    maximum are exact.
     """
 
     def __init__(self, step: float, limit: float) -> None:
@@ -21,8 +24,9 @@ class Histogram:
     def add(self, value: float, count: int = 1) -> None:
         """Count a value `count` times."""
         place = math.floor(value / self._step)
-        if not -self._last <= place <= self._last:
-            place = self._last if place > 0 else -self._last
+        if not -self._last <= place < self._last:
+            beyond = math.floor(math.log(max(1.0, abs(value) / (self._last * self._step))) / GROWTH)
+            place = self._last + beyond if place > 0 else -self._last - 1 - beyond
         self._bins[place] += count
         self.count += count
         if value < self.minimum:
@@ -40,7 +44,11 @@ class Histogram:
         return self._ranked(share, sorted(distances))
 
     def _middle(self, place: int) -> float:
-        return max(self.minimum, min(self.maximum, (place + 0.5) * self._step))
+        beyond = place - self._last if place > 0 else -self._last - 1 - place
+        middle = (place + 0.5) * self._step
+        if beyond >= 0:
+            middle = math.copysign(self._last * self._step * math.exp((beyond + 0.5) * GROWTH), place)
+        return max(self.minimum, min(self.maximum, middle))
 
     def _ranked(self, share: float, bins: list[tuple[float, int]]) -> float:
         seen, wanted = 0, share * self.count

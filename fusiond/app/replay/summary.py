@@ -266,6 +266,14 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield from _truth(summary.truth)
 
 
+def details(summary: Summary) -> Iterator[str]:
+    """What was read of each log, and how each clock was aligned, in lines."""
+    for name, counts in summary.logs.items():
+        yield f"log {name}: {', '.join(f'{count} {what}' for what, count in counts.items())}"
+    for name, clock in summary.clocks.items():
+        yield f"clock {name}: {clock.method.replace('_', ' ')}, {clock.resets} re-alignments, {clock.strays} stray stamps"
+
+
 def _source_table(sources: Mapping[str, SourceReport]) -> Iterator[str]:
     """One line per source; columns of zeros are left out, except the first three."""
     names = ["events", "fused", "rejected", "too_old", "duplicate", "invalid", "waiting", "gathered", "withheld"]

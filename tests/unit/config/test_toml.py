@@ -83,7 +83,8 @@ def test_unknown_keys_list_the_known_ones() -> None:
 
 def test_all_errors_are_told_at_once_in_the_order_of_the_file() -> None:
     text = BASE.replace('link = "autopilot"', 'link = 3') + (
-        "rotation_deg = [1, 2]\n[filter]\nhorizon_s = -1\nimu_gap = 1\n[publish]\nencoding = 'jsn'\n[wheel.w]\nunit = 'kmh'\n"
+        "rotation_deg = [1, 2]\n[filter]\nhorizon_s = -1\nimu_gap = 1\n"
+        "[publish]\nencoding = 'jsn'\n[wheel.w]\nunit = 'kmh'\n"
     )
     lines = [line.removeprefix(f"{CAR}:").split(": ")[:2] for line in complaint(text).splitlines()]
     assert lines == [

@@ -38,7 +38,7 @@ def test_demo_scenario_drives_what_its_comments_say(tmp_path: Path) -> None:
         ("[[segment]]\nspeed_mps = 3\n", "s.toml:1: segment[0]: the key 'duration_s' is missing"),
         (
             "[[segment]]\nduration_s = 1\n[[segment]]\nduration_s = 2\nspeed = 3\n",
-            "s.toml:5: segment[1].speed: unknown key (did you mean 'speed_mps'?); allowed: duration_s, grade_deg, speed_mps, turn_deg",
+            "s.toml:5: segment[1].speed: unknown key (did you mean 'speed_mps'?); allowed: duration_s, grade_deg",
         ),
         (REST.format(1) + "[imu]\nrate_hz = 5000\n", "s.toml:4: imu.rate_hz: Expected `float` <= 2000"),
         (

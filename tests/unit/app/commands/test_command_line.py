@@ -217,6 +217,50 @@ def test_check_warns_of_oddities(run: Run, folder: Path) -> None:
     assert "no [wheel.NAME]" in out
 
 
+def test_check_is_as_strict_as_run(run: Run, folder: Path) -> None:
+    """Connection strings, interfaces, endpoints and links are wrong before anything is opened, all told at once."""
+    text = (folder / "fusiond.toml").read_text()
+    (folder / "strict.toml").write_text(
+        text + '\n[mavlink.radio]\nconnection = "upd:127.0.0.1"\n[can.body]\ninterface = "socketkan"\n'
+    )
+    for command in ("check", "run"):
+        code, out, err = run(command, folder / "strict.toml")
+        assert (code, out) == (USAGE, ""), command
+        assert "mavlink.radio.connection: 'upd:127.0.0.1': unknown kind of connection" in err
+    radio = '\n[mavlink.radio]\nconnection = "udpin:127.0.0.1:14599"\n[can.body]\ninterface = "socketkan"\n'
+    (folder / "strict.toml").write_text(text + radio)
+    code, _, err = run("check", folder / "strict.toml")
+    line = (text + radio).splitlines().index('interface = "socketkan"') + 1
+    assert code == USAGE
+    assert f"strict.toml:{line}: can.body.interface: python-can has no interface 'socketkan' (did you mean 'soc" in err
+    for endpoint, complaint in (("tpc/127.0.0.1:7447", "did you mean 'tcp'?"), ("tcp/127.0.0.1:70000", "up to 65535")):
+        (folder / "strict.toml").write_text(f'{text}\n[zenoh]\nlisten = ["{endpoint}"]\n')
+        code, _, err = run("check", folder / "strict.toml")
+        assert code == USAGE
+        assert "zenoh.listen[0]: " in err and complaint in err
+
+
+def test_how_much_check_tells(run: Run, folder: Path) -> None:
+    assert run("check", "-q", folder / "fusiond.toml") == (SUCCESS, "", "")
+    _, out, _ = run("check", "-v", folder / "fusiond.toml")
+    assert "filter.horizon_s = 1.0\n" in out
+    assert run("check", "-q", "-v", folder / "fusiond.toml")[0] == USAGE
+
+
+def test_how_much_replay_tells(replay: Run) -> None:
+    assert replay("-q") == (SUCCESS, "", "")
+    _, out, _ = replay("-v")
+    assert "log drive.tlog: " in out and "clock unix: " in out
+
+
+@pytest.mark.parametrize(("option", "name"), [("--plot", "track.svg"), ("--plot", "track"), ("--mcap", "drive.bag")])
+def test_a_suffix_of_another_format_is_refused(replay: Run, tmp_path: Path, option: str, name: str) -> None:
+    code, _, err = replay(option, tmp_path / name)
+    assert code == USAGE
+    assert f"{option} {tmp_path / name}: what is written is" in err
+    assert not list(tmp_path.iterdir())
+
+
 def test_logs_of_one_name_are_distinguished(replay: Run, folder: Path, tmp_path: Path) -> None:
     lines = (folder / "drive.log").read_text().splitlines(keepends=True)
     halves = [lines[: len(lines) // 2], lines[len(lines) // 2 :]]
@@ -267,7 +311,7 @@ def test_wrong_usage(replay: Run, arguments: list[str], complaint: str) -> None:
 def test_wrong_configuration_is_reported_by_line(run: Run, folder: Path) -> None:
     for text, complaint in (
         ("[vehicle\n", "not valid TOML"),
-        ("[vehicle]\nnam = 'x'\n", "bad.toml:2: vehicle.nam: unknown key; allowed: geoid_m, name"),
+        ("[vehicle]\nnam = 'x'\n", "bad.toml:2: vehicle.nam: unknown key (did you mean 'name'?); allowed: geoid_m, name"),
     ):
         (folder / "bad.toml").write_text(text)
         for command in (["check"], ["replay", str(folder / "drive.tlog")], ["simulate", "--out", str(folder / "never")]):

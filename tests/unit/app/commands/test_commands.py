@@ -36,7 +36,8 @@ def test_the_daemon_imports_no_other_command() -> None:
     assert not [module for module in grammar if module.startswith(HEAVY)]
     own = HEAVY[:4]
     assert not [module for module in daemon if module.startswith(own)]
-    assert {module for module in daemon if module.startswith("fusiond.app.commands.")} == {"fusiond.app.commands.run"}
+    folder = "fusiond.app.commands."
+    assert {module for module in daemon if module.startswith(folder)} == {f"{folder}run", f"{folder}arguments"}
 
 
 def test_no_exception_interrupts_an_import(monkeypatch: pytest.MonkeyPatch) -> None:

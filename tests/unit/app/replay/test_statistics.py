@@ -25,9 +25,27 @@ def test_histogram_is_bounded_and_exact_at_its_ends() -> None:
     for value in (-1e9, 0.25, 1e9):
         histogram.add(value)
     assert (histogram.minimum, histogram.maximum, histogram.count) == (-1e9, 1e9, 3)
-    assert abs(histogram.quantile(1.0)) <= 11
+    assert histogram.quantile(1.0) == pytest.approx(1e9, rel=0.005)
+    assert histogram.quantile(0.1) == pytest.approx(-1e9, rel=0.005)
     with pytest.raises(ValueError, match="no value"):
         Histogram(1.0, 10.0).quantile(0.5)
+
+
+def test_quantiles_do_not_saturate_at_the_limit() -> None:
+    """A replay that is kilometres off says by how many."""
+    histogram, values = Histogram(1e-3, 1000.0), np.random.default_rng(3).uniform(-90_000.0, 300_000.0, 5000)
+    for value in values:
+        histogram.add(float(value))
+    for share in (0.05, 0.5, 0.95):
+        expected = np.quantile(values, share, method="inverted_cdf")
+        assert histogram.quantile(share) == pytest.approx(expected, rel=0.006)
+
+
+def test_the_limit_itself() -> None:
+    for value in (-10.0, 10.0, 9.999, -9.999):
+        histogram = Histogram(1.0, 10.0)
+        histogram.add(value)
+        assert histogram.quantile(0.5) == pytest.approx(value)
 
 
 def test_mean_and_variance_are_numpys() -> None:
