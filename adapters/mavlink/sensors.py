@@ -11,17 +11,15 @@ from fusiond.config.schema import Barometer, Config, DualAntenna, Gnss, Imu, Whe
 from fusiond.config.sensor import Sensor
 from fusiond.events import (
     AnyPayload,
-    GnssPosition,
-    GnssVelocity,
     GnssYaw,
     ImuSample,
     Invalid,
     Pressure,
     Received,
-    Vector3,
     WheelSpeed,
 )
 from fusiond.units import MILLISECOND, SECOND
+from fusiond_adapters.payloads import InertialAxes, gnss_position, velocity_by_course
 
 MILLI_G = 9.80665e-3  # m/s^2
 UNKNOWN_U16 = 65535
@@ -66,9 +64,8 @@ class ImuHandler:
     def __init__(self, decoder: Decoder, name: str, imu: Imu, _config: Config) -> None:
         self._decoder, self._name, self._imu = decoder, name, imu
         self.fields = (_IMU_STAMP.get(imu.message, "time_boot_ms"), *_AXES, *_IMU_EXTRA.get(imu.message, ()))
-        self._mat_bs = _rotation(imu.rotation_deg) if any(imu.rotation_deg) else None  # sensor axes to body
+        self._axes = InertialAxes(imu)
         self._si = imu.message == "HIGHRES_IMU"
-        self._limits = imu.accel_limit, imu.gyro_limit
         self._stamp_us = 1 if imu.message in _IMU_STAMP else 1000  # unit of the stamp [us]
 
     def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
@@ -86,14 +83,7 @@ class ImuHandler:
             rate = (rate[0] / 1e3, rate[1] / 1e3, rate[2] / 1e3)
         elif fields[7] & ACCEL_AND_GYRO != ACCEL_AND_GYRO:
             return Invalid("not updated")
-        accel_limit, gyro_limit = self._limits
-        calm, slow = _within(force, accel_limit), _within(rate, gyro_limit)
-        if not (calm and slow):
-            finite = math.isfinite(sum(force) + sum(rate))
-            return Invalid(("beyond gyro_limit" if calm else "beyond accel_limit") if finite else "not finite")
-        if self._mat_bs is None:
-            return ImuSample(force, rate)
-        return ImuSample(_rotated(self._mat_bs, force), _rotated(self._mat_bs, rate))
+        return self._axes.sample(force, rate)
 
 
 class GnssHandler:
@@ -110,20 +100,11 @@ class GnssHandler:
 
     def events(self, fields: tuple[Any, ...], t_receive_ns: int) -> list[Received]:
         time_us, fix_type, lat, lon, alt, vel, cog, alt_ellipsoid, h_acc, v_acc, vel_acc = fields
-        position: AnyPayload
-        velocity: AnyPayload
-        if fix_type < self._gnss.minimum_fix_type:
-            position = velocity = Invalid("no fix")
-        elif lat == 0 and lon == 0:
-            position = velocity = Invalid("no position")
-        elif abs(lat) > 900_000_000 or abs(lon) > 1_800_000_000:
-            position = velocity = Invalid("not on earth")
-        else:
-            height = (alt_ellipsoid or alt) / 1e3
-            latitude, longitude = math.radians(lat / 1e7), math.radians(lon / 1e7)
-            position = GnssPosition(latitude, longitude, height, _known(h_acc), _known(v_acc), fix_type)
-            speed, course = vel / 1e2, math.radians(cog / 1e2)
-            velocity = GnssVelocity(speed * math.cos(course), speed * math.sin(course), None, _known(vel_acc))
+        place = lat / 1e7, lon / 1e7, (alt_ellipsoid or alt) / 1e3
+        position = gnss_position(self._gnss, fix_type, place, _known(h_acc), _known(v_acc))
+        velocity: AnyPayload = position
+        if not isinstance(position, Invalid):
+            velocity = velocity_by_course(vel / 1e2, math.radians(cog / 1e2), _known(vel_acc))
         decoder = self._decoder
         stamp = decoder.stamp(time_us) if self._gnss.stamp == "sensor" else ("", None)
         events = [decoder.event(self._position, stamp, t_receive_ns, position)]
@@ -257,25 +238,3 @@ HANDLERS: dict[type[Sensor], Callable[[Decoder, str, Any, Config], Handler]] = {
 def _known(thousandths: int) -> float | None:
     """An accuracy of the extension fields [mm or mm/s]; 0 means unknown."""
     return thousandths / 1e3 if thousandths else None
-
-
-def _within(vector: Vector3, limit: float) -> bool:
-    """Is every component finite, and at most `limit` in size?"""
-    x, y, z = vector
-    return -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit
-
-
-def _rotation(angles_deg: Vector3) -> tuple[Vector3, Vector3, Vector3]:
-    """The matrix Rz(yaw) Ry(pitch) Rx(roll), row by row: it rotates a vector from the sensor's axes to the body's."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in map(math.radians, angles_deg))
-    return (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-
-
-def _rotated(mat: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
-    x, y, z = vector
-    (a, b, c), (d, e, f), (g, h, i) = mat
-    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z

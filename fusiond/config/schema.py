@@ -12,7 +12,17 @@ from msgspec import Meta, field
 
 from fusiond import events
 from fusiond.config.outputs import Autopilot, Foxglove, GroundStation, Mcap, Prometheus, Publish, Record, Ros2, Zenoh
-from fusiond.config.sensor import INERTIAL, Sensor, Stream, delay_in_words, point_in_words, vector_in_words
+from fusiond.config.sensor import (
+    INERTIAL,
+    Sensor,
+    Signal,
+    Stream,
+    delay_in_words,
+    messages_of,
+    point_in_words,
+    signal_contradictions,
+    vector_in_words,
+)
 from fusiond.config.toml import Name, NotNegative, Positive, Section, Vector
 from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Pressure, WheelSpeed
 from fusiond.units import MILLISECOND
@@ -25,6 +35,10 @@ CAN_KEYS = ("message", "signal")  # of a wheel that comes by CAN
 GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
 STAMPS = {"sensor": "by its own stamp", "arrival": "by its arrival"}
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
+SpeedUnit = Literal["m/s", "km/h", "mph", "kn"]
+AccelUnit = Literal["m/s^2", "g", "mg"]
+RateUnit = Literal["rad/s", "deg/s"]
+Signals = tuple[Signal, Signal, Signal]
 PressureMessage = Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"]
 Checksum = Literal["toyota", "honda", "hyundai", "tesla"]
 GnssMessage = Literal["GPS_RAW_INT", "GPS2_RAW"]
@@ -114,14 +128,22 @@ class Can(Section, frozen=True, kw_only=True):
 
 
 class Imu(Sensor, frozen=True, kw_only=True):
-    """[imu.NAME]: the IMU that propagates the state. Exactly one."""
+    """[imu.NAME]: the IMU that propagates the state. Exactly one. It comes by MAVLink (link, message) or by CAN (bus and
+    the signals)."""
 
     label: ClassVar[str] = "IMU"
     required: ClassVar[bool] = True
 
-    link: Name  # the [mavlink.LINK] that carries it
+    link: Name | None = None  # the [mavlink.LINK] that carries it
     message: ImuMessage = "HIGHRES_IMU"  # the message that carries it
     instance: Annotated[int, Meta(ge=0)] = 0  # HIGHRES_IMU's id
+    bus: Name | None = None  # the [can.BUS] that carries it, in place of link
+    accel_signals: Signals | None = None  # specific force along its axes x, y, z, each MESSAGE.SIGNAL of the DBC
+    gyro_signals: Signals | None = None  # angular rate about them
+    accel_unit: AccelUnit = "m/s^2"  # of accel_signals
+    gyro_unit: RateUnit = "rad/s"  # of gyro_signals
+    valid_signals: list[Signal] = field(default_factory=list)  # signals that must all equal valid_value
+    valid_value: int = 1  # what they must read
     rate_hz: Annotated[float, Meta(gt=0, le=4000)] = 100.0  # samples a second to request from the autopilot, live
     rotation_deg: Vector = (0.0, 0.0, 0.0)  # mounting roll, pitch, yaw of the sensor's axes against forward-right-down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the sample was measured
@@ -139,7 +161,14 @@ class Imu(Sensor, frozen=True, kw_only=True):
         return (Stream(INERTIAL, ImuSample, self.delay_ms),)
 
     def messages(self) -> dict[str, float]:
-        return {self.message: self.rate_hz}
+        return {self.message: self.rate_hz} if self.bus is None else messages_of(self.signals())
+
+    def signals(self) -> tuple[str, ...]:
+        """The signals of the bus that it reads."""
+        return (*(self.accel_signals or ()), *(self.gyro_signals or ()), *self.valid_signals)
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        yield from signal_contradictions(self, ("accel_signals", "gyro_signals"), ("valid_signals",))
 
     def description(self, name: str) -> Iterator[str]:
         learnt = f" +- {self.delay_sigma_ms:g} ms, learnt" if self.delay_sigma_ms else ""
@@ -149,13 +178,33 @@ class Imu(Sensor, frozen=True, kw_only=True):
 
 
 class Gnss(Sensor, frozen=True, kw_only=True):
-    """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity."""
+    """[gnss.NAME]: a GNSS receiver; it feeds the sources NAME.position and NAME.velocity. It comes by MAVLink (link,
+    message) or by CAN (bus and the signals, which may be of several messages)."""
 
     label: ClassVar[str] = "GNSS"
     point: ClassVar[str] = "lever_arm_m"
 
-    link: Name  # the [mavlink.LINK] that carries it
+    link: Name | None = None  # the [mavlink.LINK] that carries it
     message: GnssMessage = "GPS_RAW_INT"  # the message that carries it
+    bus: Name | None = None  # the [can.BUS] that carries it, in place of link
+    latitude_signal: Signal | None = None  # [deg], MESSAGE.SIGNAL of the DBC, as all these
+    longitude_signal: Signal | None = None  # [deg]
+    height_signal: Signal | None = None  # [m]
+    speed_signal: Signal | None = None  # speed over ground, in speed_unit
+    course_signal: Signal | None = None  # course over ground [deg], clockwise from north
+    north_signal: Signal | None = None  # velocity north, in speed_unit, in place of speed and course
+    east_signal: Signal | None = None  # velocity east
+    down_signal: Signal | None = None  # velocity down, where it gives it
+    speed_unit: SpeedUnit = "m/s"  # of the speed, or the velocity
+    position_sigma_signal: Signal | None = None  # accuracy of the position, horizontal [m]
+    height_sigma_signal: Signal | None = None  # accuracy of the height [m]
+    velocity_sigma_signal: Signal | None = None  # accuracy of the speed, in speed_unit
+    course_sigma_signal: Signal | None = None  # accuracy of the course [deg]
+    time_signal: Signal | None = None  # time of the fix [s], of any zero; without it the receipt is its stamp
+    fix_type_signal: Signal | None = None  # its kind of fix; without it each is 3-D
+    fix_types: list[Annotated[int, Meta(ge=0, le=8)]] = field(default_factory=list)  # GPS_FIX_TYPE by its value
+    valid_signals: list[Signal] = field(default_factory=list)  # what comes with one that is not valid_value is invalid
+    valid_value: int = 1  # what they must read
     lever_arm_m: Vector = (0.0, 0.0, 0.0)  # antenna from the IMU: forward, right, down
     delay_ms: Milliseconds = 0.0  # how long before its stamp the position was measured
     velocity_delay_ms: Milliseconds = 0.0  # additional delay of the velocity (receivers smooth it)
@@ -206,7 +255,7 @@ class Gnss(Sensor, frozen=True, kw_only=True):
             GnssVelocity,
             self.delay_ms + self.velocity_delay_ms,
             suffix=".velocity",
-            enabled=self.use_velocity,
+            enabled=self.gives_velocity,
             correlation_s=self.velocity_correlation_s,
             sigma=self.velocity_sigma_mps,
             noise_min=self.noise_least,
@@ -228,17 +277,56 @@ class Gnss(Sensor, frozen=True, kw_only=True):
         return min(least[0], self.position_sigma_m), min(least[1], self.height_sigma_m)
 
     def messages(self) -> dict[str, float]:
-        return {self.message: 1 / self.interval_s}
+        return {self.message: 1 / self.interval_s} if self.bus is None else messages_of(self.signals())
+
+    def position_signals(self) -> tuple[str, ...]:
+        """The signals of a bus that make a position; empty where they are not all given."""
+        return _all((self.latitude_signal, self.longitude_signal, self.height_signal))
+
+    def velocity_signals(self) -> tuple[str, ...]:
+        """The signals of a bus that make a velocity: north, east and perhaps down, or speed and course. Empty without."""
+        down = () if self.down_signal is None else (self.down_signal,)
+        return _all((self.north_signal, self.east_signal, *down)) or _all((self.speed_signal, self.course_signal))
+
+    @property
+    def gives_velocity(self) -> bool:
+        """Whether it is configured to feed NAME.velocity."""
+        return self.use_velocity and (self.bus is None or bool(self.velocity_signals()))
+
+    def signals(self) -> tuple[str, ...]:
+        """The signals of a bus that it reads."""
+        one = (getattr(self, key) for key in GNSS_SIGNALS)
+        return (*(signal for signal in one if signal is not None), *self.valid_signals)
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        yield from signal_contradictions(self, GNSS_SIGNALS[:3], (*GNSS_SIGNALS[3:], "valid_signals", "fix_types"))
+        given = [key for key in GNSS_SIGNALS[3:8] if getattr(self, key) is not None]
+        if given and self.velocity_signals() != tuple(getattr(self, key) for key in given):
+            yield given[0], "a velocity is speed_signal and course_signal, or north_signal and east_signal (and down_signal)"
 
     def description(self, name: str) -> Iterator[str]:
         yield f"{self.origin()}, {STAMPS[self.stamp]}, {delay_in_words(self.delay_ms)}"
         yield f"feeds {name}.position: sigma {self.position_sigma_m:g} m, in height {self.height_sigma_m:g} m"
         fixed, height = self.sigmas(events.FIX_FIXED)
         yield f"while it is RTK fixed: sigma {fixed:g} m, in height {height:g} m"
-        if self.use_velocity:
+        if self.gives_velocity:
             delay = delay_in_words(self.delay_ms + self.velocity_delay_ms)
             yield f"feeds {name}.velocity: sigma {self.velocity_sigma_mps:g} m/s, {delay}"
         yield f"antenna at {point_in_words(self.lever_arm_m)} from the IMU"
+
+
+GNSS_SIGNALS = (  # the keys of Gnss that name one signal: of the position, of the velocity, others
+    "latitude_signal", "longitude_signal", "height_signal",
+    "speed_signal", "course_signal", "north_signal", "east_signal", "down_signal",
+    "position_sigma_signal", "height_sigma_signal", "velocity_sigma_signal", "course_sigma_signal",
+    "time_signal", "fix_type_signal",
+)  # fmt: skip
+
+
+def _all(signals: tuple[str | None, ...]) -> tuple[str, ...]:
+    """The signals if all are given, else none."""
+    given = tuple(signal for signal in signals if signal is not None)
+    return given if len(given) == len(signals) else ()
 
 
 class DualAntenna(Sensor, frozen=True, kw_only=True):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
-from typing import ClassVar, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Annotated, ClassVar, NamedTuple
+
+from msgspec import Meta
 
 from fusiond.config.toml import Section
 from fusiond.events import Payload, Vector3
 
 INERTIAL = "imu"  # in place of an observation model: the stream that propagates the state
 INPUTS = {"link": "mavlink", "bus": "can"}  # the key by which a sensor names its input: the table of those inputs
+
+Signal = Annotated[str, Meta(pattern=r"^[^.]+\.[^.]+$", description="a signal of the DBC, written MESSAGE.SIGNAL")]
 
 
 class Stream(NamedTuple):
@@ -67,6 +71,31 @@ class Sensor(Section, frozen=True, kw_only=True):
         """The inputs that carry it: the keys of INPUTS that it has, and their values."""
         names = {key: getattr(self, key, None) for key in INPUTS}
         return {key: name for key, name in names.items() if name is not None}
+
+
+def split_signal(signal: str) -> tuple[str, str]:
+    """MESSAGE.SIGNAL as its message and its own name."""
+    message, _, name = signal.partition(".")
+    return message, name
+
+
+def messages_of(signals: Iterable[str]) -> dict[str, float]:
+    """The messages of a bus that carry these signals, with the rate to request: none."""
+    return {split_signal(signal)[0]: 0.0 for signal in signals}
+
+
+def signal_contradictions(section: Sensor, needed: tuple[str, ...], others: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    """What is wrong with a sensor that comes by link, or by bus with the keys `needed` and perhaps `others`."""
+    inputs = section.inputs()
+    if len(inputs) != 1:
+        yield "", "one of 'link' (MAVLink) and 'bus' (CAN) is needed, and not both"
+        return
+    for key in needed:
+        if "bus" in inputs and getattr(section, key) is None:
+            yield "", f"the key '{key}' is missing: it comes by bus"
+    for key in needed + others:
+        if "link" in inputs and getattr(section, key):
+            yield key, "has no meaning for a sensor that comes by link"
 
 
 def vector_in_words(vector: Vector3) -> str:

@@ -183,7 +183,7 @@ def _type_of(kind: type[Section], key: str) -> object:
     *tables, last = key.split(".")
     here = _kind_at(kind, tables)
     types = {item.name: item.type for item in msgspec.structs.fields(here)} if here else {}
-    return types.get(last)
+    return types.get(last.split("[")[0])
 
 
 def _descriptions(hint: object) -> list[str]:

@@ -57,9 +57,55 @@ def test_contradictions(text: str, line: int, key: str, parts: list[str]) -> Non
     check(BASE + text, line, key, *parts)
 
 
+SIGNALS = "bus = 'c'\naccel_signals = ['m.x', 'm.y', 'm.z']\ngyro_signals = ['m.p', 'm.q', 'm.r']\n"
+PLACE = "bus = 'c'\nlatitude_signal = 'm.a'\nlongitude_signal = 'm.b'\nheight_signal = 'm.h'\n"
+BOTH = "one of 'link' (MAVLink) and 'bus' (CAN) is needed, and not both"
+
+
+@pytest.mark.parametrize(
+    ("sensor", "line", "key", "complaint"),
+    [
+        (SIGNALS.replace("gyro_signals", "# "), 3, "imu.imu0", "the key 'gyro_signals' is missing: it comes by bus"),
+        (SIGNALS + "link = 'autopilot'", 3, "imu.imu0", BOTH),
+        (SIGNALS.replace("m.p", "p"), 6, "imu.imu0.gyro_signals[0]", "must be a signal of the DBC, written MESSAGE.SIGNAL"),
+        (SIGNALS.replace("bus = 'c'", "link = 'autopilot'"), 5, "imu.imu0.accel_signals", "no meaning for a sensor that"),
+    ],
+)
+def test_contradictions_of_an_imu(tmp_path: Path, sensor: str, line: int, key: str, complaint: str) -> None:
+    (tmp_path / DBC).touch()
+    with pytest.raises(ConfigError) as raised:
+        config.parse(f"[mavlink.autopilot]\n[can.c]\n[imu.imu0]\n{sensor}\n", tmp_path / "car.toml")
+    assert f"car.toml:{line}: {key}: " in str(raised.value)
+    assert complaint in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [
+        ("speed_signal = 'm.s'", "a velocity is speed_signal and course_signal, or north_signal and east_signal"),
+        ("north_signal = 'm.n'\neast_signal = 'm.e'\ncourse_signal = 'm.s'", "a velocity is speed_signal"),
+        ("link = 'autopilot'", BOTH),
+    ],
+)
+def test_contradictions_of_a_receiver(more: str, complaint: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        config.parse(f"{BASE}[can.c]\n[gnss.gps0]\n{PLACE}{more}\n")
+    assert complaint in str(raised.value)
+
+
+def test_a_receiver_on_a_bus_gives_a_velocity_where_its_signals_do(tmp_path: Path) -> None:
+    (tmp_path / DBC).touch()
+    text = f"{BASE}[can.c]\ndbc = ['{DBC}']\n[gnss.gps0]\n{PLACE}"
+    for more, enabled in (("", False), ("speed_signal = 's.s'\ncourse_signal = 's.c'", True)):
+        loaded = config.parse(f"{text}{more}\n", tmp_path / "car.toml")
+        assert loaded.streams()["gps0.velocity"].stream.enabled is enabled
+        assert set(loaded.gnss["gps0"].messages()) == ({"m", "s"} if enabled else {"m"})
+
+
 SENSORS = {  # a table of each kind of sensor, its last line the input that it comes by
     "imu.imu0": "link = 'autopilot'",
     "gnss.gps0": "link = 'autopilot'",
+    "gnss.gps1": "latitude_signal = 'm.a'\nlongitude_signal = 'm.b'\nheight_signal = 'm.c'\nbus = 'chassis'",
     "wheel.left": "message = 'm'\nsignal = 's'\nbus = 'chassis'",
     "wheel.right": "index = 2\nlink = 'autopilot'",
     "barometer.b": "link = 'autopilot'",

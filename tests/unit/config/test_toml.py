@@ -108,7 +108,8 @@ def test_the_errors_of_a_hopeless_file_end() -> None:
 
 
 def test_missing_keys() -> None:
-    check(BASE + "[gnss.gps0]\nmessage = 'GPS2_RAW'", 4, "gnss.gps0", "the key 'link' is missing")
+    check(BASE + "[gnss.gps0]\nmessage = 'GPS2_RAW'", 4, "gnss.gps0", "one of 'link' (MAVLink) and 'bus' (CAN) is needed")
+    check(BASE + "[dual_antenna.yaw]\nmessage = 'GPS2_RAW'", 4, "dual_antenna.yaw", "the key 'link' is missing")
     check(BASE + "[wheel.w]\nbus = 'b'\nmessage = 'm'", 4, "wheel.w", "the key 'signal' is missing")
 
 

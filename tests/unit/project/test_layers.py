@@ -33,7 +33,7 @@ ACROSS = {  # folders of one protocol that import another's, and why
     ("logs", "can"): "a candump log holds CAN frames",
     ("mcap", "foxglove"): "MCAP files hold what Foxglove shows",
 }
-SHARED = {"host", "registry"}  # adapters that belong to no protocol: the host's clock; the table of all of them
+SHARED = {"host", "payloads", "registry"}  # of no protocol: clock, what sensors measured, table of all
 NEVER = {  # imports that the order would allow
     ("fusiond_adapters", "fusiond.filter"): "an adapter knows a protocol and nothing of filters",
     ("fusiond_adapters", "fusiond.timeline"): "an adapter passes on the stamps that it gets",
