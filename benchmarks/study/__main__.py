@@ -25,6 +25,7 @@ from benchmarks.study import (
     mismatch,
     outage,
     reboot,
+    reckoning,
     rover,
     rtk,
 )
@@ -35,6 +36,7 @@ PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the numbe
     "consistency": (consistency.consistency, 100),
     "bound": (consistency.bound, 100),
     "outage": (outage.outage, 20),
+    "reckoning": (reckoning.reckoning, 40),
     "heading": (heading.heading, 100),
     "faults": (faults.faults, 20),
     "calibration": (calibration.calibration, 20),

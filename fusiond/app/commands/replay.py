@@ -14,6 +14,7 @@ from fusiond.app.commands.arguments import add_config_and_logs, add_verbosity, t
 from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.intervals import parse_interval, parse_withheld
 from fusiond.app.replay.job import Options, replay
+from fusiond.app.replay.outages import parse_length
 from fusiond.app.replay.summary import details, text
 from fusiond.config import load as config
 from fusiond.errors import UsageError
@@ -30,6 +31,8 @@ examples:
       compare seconds 10 to 30 with a reference, and draw the errors
   fusiond replay car.toml drive.tlog drive.log --truth truth.csv --withhold gps0:12-22 --window 12-22
       how large is the error after ten seconds without GNSS?
+  fusiond replay car.toml drive.tlog drive.log --truth truth.csv --outage-length 1000m
+      how large are the errors after 1000 m without GNSS, anywhere in the drive?
   fusiond replay car.toml drive.tlog drive.log --speed 1 --publish
       publish over Zenoh everything that `fusiond run` would, in real time: run `fusiond top` beside it
   fusiond replay car.toml drive.tlog drive.log --speed 1 --outputs
@@ -57,6 +60,12 @@ def fill(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="withhold a source between these seconds from the first event, such as gps0:12-22; may be repeated",
     )
+    add(
+        "--outage-length",
+        metavar="LENGTH",
+        help="with --truth: replay again with GNSS withheld over many stretches of this length, such as 1000m or 60s, and"
+        " tell the errors at their ends",
+    )
     add("--rate", metavar="HZ", type=rate, help="publications per second; default: publish.rate_hz of the config")
     add("--speed", metavar="X", type=positive, help="replay at X times real time; default: as fast as possible")
     add("--publish", action="store_true", help="publish over Zenoh, as configured, everything that `fusiond run` publishes")
@@ -69,6 +78,8 @@ def run(arguments: argparse.Namespace) -> None:
     loaded = config.load(name)
     if arguments.window and not arguments.truth:
         raise UsageError("--window limits the comparison with a truth: give --truth as well")
+    if arguments.outage_length and not arguments.truth:
+        raise UsageError("--outage-length compares with a truth: give --truth as well")
     if arguments.publish or arguments.outputs:
         journal.set_up(logging.WARNING)  # reports the loss of an output
     options = Options(
@@ -83,6 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
         stored=arguments.stored,
         withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
         window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
+        outage_length=parse_length(arguments.outage_length) if arguments.outage_length else None,
         rate_hz=arguments.rate,
         speed=arguments.speed,
         publish=arguments.publish,

@@ -13,6 +13,7 @@ from fusiond.maths.statistics import chi_square
 from fusiond.messages.types import State, StateMessage
 from fusiond.units import SECOND
 
+USUAL_SHARE = 0.68  # of the errors, by which makers of receivers give an accuracy
 ELLIPSE_95 = chi_square(0.95, 2)  # squared Mahalanobis distance of the 95 % ellipse: 5.99
 
 POSITION_STEP, POSITION_LIMIT = 1e-3, 1000.0  # m, width and limit of the histogram's bins
@@ -30,6 +31,8 @@ class Errors(NamedTuple):
     yaw_deg: float  # wrapped
     nees: float  # squared horizontal position error in units of the published covariance; infinite if that is singular
     true: TruthSample
+    pitch_deg: float = math.nan  # not a number where the truth has none
+    roll_deg: float = math.nan
 
     @property
     def horizontal_m(self) -> float:
@@ -56,6 +59,8 @@ def errors_of(message: StateMessage, true: TruthSample | None) -> Errors | None:
         wrapped(state.yaw_deg - true.yaw_deg),
         _mahalanobis2(north, east, state),
         true,
+        state.pitch_deg - true.pitch_deg,
+        wrapped(state.roll_deg - true.roll_deg),
     )
 
 
@@ -72,6 +77,7 @@ class PositionReport(Struct, frozen=True, kw_only=True):
     """Horizontal position error, published less true [m]."""
 
     rmse_m: float
+    p68_m: float
     p95_m: float
     max_m: float
     offset_north_m: float  # the mean error
@@ -82,10 +88,11 @@ class PositionReport(Struct, frozen=True, kw_only=True):
     nees: float | None = None  # mean squared error in units of the published covariance: 2 is honest; null: one is singular
 
 
-class HeadingReport(Struct, frozen=True, kw_only=True):
-    """Heading error [deg], its mean removed: the truth's axes and the IMU's need not be the same."""
+class AngleReport(Struct, frozen=True, kw_only=True):
+    """Error of an angle [deg], its mean removed: the truth's axes and the IMU's need not be the same."""
 
     rmse_deg: float
+    p68_deg: float
     p95_deg: float
     offset_deg: float  # the mean that was removed
 
@@ -100,8 +107,11 @@ class TruthReport(Struct, frozen=True, kw_only=True):
     position: PositionReport
     height_rmse_m: float
     velocity_rmse_mps: float  # horizontal
+    velocity_p68_mps: float
     velocity_p95_mps: float
-    heading: HeadingReport
+    heading: AngleReport
+    pitch: AngleReport | None = None  # None if the truth has none
+    roll: AngleReport | None = None
 
 
 class Window(NamedTuple):
@@ -111,17 +121,42 @@ class Window(NamedTuple):
     stop_s: float = math.inf
 
 
+class _Angle:
+    """Errors of one angle, counted from the first one, so that an offset near 180 deg does not wrap."""
+
+    def __init__(self) -> None:
+        self._first = 0.0
+        self._mean, self._histogram = Mean(), Histogram(ANGLE_STEP, ANGLE_LIMIT)
+
+    def add(self, error_deg: float) -> None:
+        if not self._mean.count:
+            self._first = error_deg
+        since = wrapped(error_deg - self._first)
+        self._mean.add(since)
+        self._histogram.add(since)
+
+    def report(self) -> AngleReport | None:
+        if not self._mean.count:
+            return None
+        return AngleReport(
+            rmse_deg=math.sqrt(self._mean.variance),
+            p68_deg=self._histogram.quantile_of_distance(USUAL_SHARE, self._mean.value),
+            p95_deg=self._histogram.quantile_of_distance(0.95, self._mean.value),
+            offset_deg=wrapped(self._first + self._mean.value),
+        )
+
+
 class Comparison:
     """Statistics of the errors within a window of the drive."""
 
     def __init__(self, window: Window | None = None) -> None:
         self._window = window or Window()
-        self._north, self._east, self._height, self._heading = Mean(), Mean(), Mean(), Mean()
+        self._north, self._east, self._height = Mean(), Mean(), Mean()
         self._speed, self._inside, self._nees = Mean(), Mean(), Mean()
         self._horizontals = Histogram(POSITION_STEP, POSITION_LIMIT)
         self._speeds = Histogram(SPEED_STEP, SPEED_LIMIT)
-        self._headings = Histogram(ANGLE_STEP, ANGLE_LIMIT)
-        self._first_yaw = 0.0  # heading errors are counted from the first one, so that an offset near 180 deg does not wrap
+        self._heading, self._pitch, self._roll = _Angle(), _Angle(), _Angle()
+        self._level_told = False  # a reference without pitch and roll may have zeros for them
         self._start_s = self._stop_s = self._distance = 0.0
         self._last: Errors | None = None
 
@@ -131,7 +166,7 @@ class Comparison:
         if not self._window.start_s <= second <= self._window.stop_s:
             return
         if self._last is None:
-            self._start_s, self._first_yaw = second, errors.yaw_deg
+            self._start_s = second
         else:
             before, true = self._last.true, errors.true
             origin = before.lat_deg, before.lon_deg
@@ -143,15 +178,18 @@ class Comparison:
         self._speed.add(errors.velocity_mps)
         self._inside.add(float(errors.inside))
         self._nees.add(errors.nees)
-        heading = wrapped(errors.yaw_deg - self._first_yaw)
-        self._heading.add(heading)
         self._horizontals.add(errors.horizontal_m)
         self._speeds.add(errors.velocity_mps)
-        self._headings.add(heading)
+        self._heading.add(errors.yaw_deg)
+        if math.isfinite(errors.pitch_deg) and math.isfinite(errors.roll_deg):
+            self._level_told = self._level_told or errors.true.pitch_deg != 0 or errors.true.roll_deg != 0
+            self._pitch.add(errors.pitch_deg)
+            self._roll.add(errors.roll_deg)
 
     def report(self) -> TruthReport | None:
         """The statistics; None if nothing could be compared."""
-        if self._last is None:
+        heading = self._heading.report()
+        if self._last is None or heading is None:
             return None
         return TruthReport(
             start_s=self._start_s,
@@ -160,6 +198,7 @@ class Comparison:
             distance_m=self._distance,
             position=PositionReport(
                 rmse_m=math.sqrt(self._north.square + self._east.square),
+                p68_m=self._horizontals.quantile(USUAL_SHARE),
                 p95_m=self._horizontals.quantile(0.95),
                 max_m=self._horizontals.maximum,
                 offset_north_m=self._north.value,
@@ -171,10 +210,9 @@ class Comparison:
             ),
             height_rmse_m=math.sqrt(self._height.square),
             velocity_rmse_mps=math.sqrt(self._speed.square),
+            velocity_p68_mps=self._speeds.quantile(USUAL_SHARE),
             velocity_p95_mps=self._speeds.quantile(0.95),
-            heading=HeadingReport(
-                rmse_deg=math.sqrt(self._heading.variance),
-                p95_deg=self._headings.quantile_of_distance(0.95, self._heading.value),
-                offset_deg=wrapped(self._first_yaw + self._heading.value),
-            ),
+            heading=heading,
+            pitch=self._pitch.report() if self._level_told else None,
+            roll=self._roll.report() if self._level_told else None,
         )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from fusiond.app.kernel import slow_kernel
 from fusiond.app.progress import shown
@@ -24,6 +27,18 @@ from fusiond.app.replay.files import (
     with_short_names,
 )
 from fusiond.app.replay.intervals import Withheld
+from fusiond.app.replay.outages import (
+    RECOVERY_S,
+    Length,
+    Outage,
+    OutageLog,
+    OutageReport,
+    Stretch,
+    course,
+    plan,
+    report,
+    withheld,
+)
 from fusiond.app.replay.pacer import Pacer
 from fusiond.app.replay.replay import WHOLE, Replay, ReplayTask
 from fusiond.app.replay.summary import Summary, to_json
@@ -52,6 +67,7 @@ class Options:
     withheld: Sequence[Withheld] = ()
     window: Window = WHOLE
     rate_hz: float | None = None  # default: the configuration's
+    outage_length: Length | None = None  # replay again with GNSS outages of this length; needs a truth
     speed: float | None = None  # default: as fast as possible
     publish: bool = False  # over Zenoh
     outputs: bool = False  # to every output that the configuration turns on
@@ -92,6 +108,8 @@ def replay(options: Options) -> Summary:
         share = options.share or (lambda _: logs.bytes_read / logs.bytes_total)
         run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr) if options.bar else logs)
     summary = _summary(options, run, logs, attached_warnings)
+    if options.outage_length:
+        summary = _with_outages(options, options.outage_length, run, task, summary)
     if options.json:
         with delivering(options.json):
             options.json.write_bytes(to_json(summary))
@@ -102,6 +120,33 @@ def replay(options: Options) -> Summary:
         with delivering(options.plot):
             draw(trace, summary, options.plot)
     return summary
+
+
+def _with_outages(options: Options, length: Length, run: Replay, task: ReplayTask, summary: Summary) -> Summary:
+    """The summary with the errors after outages, for which the logs are replayed several times more."""
+    assert task.truth is not None
+    begin_s = (run.first_nominal_s if run.first_nominal_s is not None else math.inf) + RECOVERY_S
+    passes = plan(course(task.truth, run.engine.origin_ns), length, begin_s)
+    ends: list[Outage | None] = []
+    for stretches in passes:
+        ends += _replay_outages(options, stretches, task)
+    found: OutageReport | None = report(length, ends)
+    if found is None:
+        summary.warnings.append(
+            f"--outage-length: the drive has no stretch of {length} with a truth after {RECOVERY_S:g} s with GNSS"
+        )
+    return replace(summary, outages=found)
+
+
+def _replay_outages(options: Options, stretches: Sequence[Stretch], task: ReplayTask) -> list[Outage | None]:
+    """One replay with GNSS withheld over the stretches: the last state of each."""
+    logs, log = open_logs(options.logs, options.config), OutageLog(stretches)
+    held = [*task.withheld, *withheld(stretches, options.config)]
+    again = ReplayTask(task.rate_hz, held, task.truth, stored_state=task.stored_state)
+    run = Replay(options.config, again)
+    again.on_tick.append(lambda state, errors: log.add(state.t_ns - run.engine.origin_ns, state, errors))
+    run.run(shown(logs, lambda: logs.bytes_read / logs.bytes_total, lambda: run.elapsed_ns, sys.stderr))
+    return log.ends()
 
 
 def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:

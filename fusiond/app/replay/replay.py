@@ -27,6 +27,7 @@ from fusiond.app.replay.truth import Truth
 from fusiond.config.schema import Config
 from fusiond.engine import Engine
 from fusiond.estimator.fusion import Receipt
+from fusiond.estimator.solution import Mode
 from fusiond.events import ClockPair, Received
 from fusiond.filter.rows import Outcome
 from fusiond.filter.source_health import misreading
@@ -65,6 +66,7 @@ class Replay:
     def __init__(self, config: Config, task: ReplayTask) -> None:
         self.config = config
         self.events = self.clock_pairs = 0
+        self.first_nominal_s: float | None = None  # of the first nominal state, from the first event
         self._task = task
         self._ticking = bool(task.on_tick or task.on_message) or task.truth is not None
         self.engine = Engine(
@@ -139,6 +141,8 @@ class Replay:
         since_start_ns = state.t_ns - self.engine.origin_ns
         errors = errors_of(state, self._task.truth.at(state.t_ns)) if self._task.truth else None
         self._modes[state.mode.value] += 1
+        if self.first_nominal_s is None and state.mode is Mode.NOMINAL:
+            self.first_nominal_s = since_start_ns / SECOND
         self._reckoning.add(since_start_ns, state, errors)
         if errors:
             self._comparison.add(since_start_ns, errors)

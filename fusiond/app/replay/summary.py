@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 import msgspec
 from msgspec import Struct
 
-from fusiond.app.replay.comparison import Errors, TruthReport
+from fusiond.app.replay.comparison import AngleReport, Errors, TruthReport
+from fusiond.app.replay.outages import OutageReport
 from fusiond.app.replay.statistics import Histogram
 from fusiond.estimator.solution import Mode
 from fusiond.messages.types import StateMessage
@@ -121,6 +122,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     published: Publications | None = None
     dead_reckoning: DeadReckoning | None = None
     truth: TruthReport | None = None
+    outages: OutageReport | None = None
 
 
 def to_json(summary: Summary) -> bytes:
@@ -264,6 +266,9 @@ def _lines(summary: Summary) -> Iterator[str]:
     if summary.truth:
         yield ""
         yield from _truth(summary.truth)
+    if summary.outages:
+        yield ""
+        yield from _outages(summary.outages)
 
 
 def details(summary: Summary) -> Iterator[str]:
@@ -365,22 +370,42 @@ def _truth(truth: TruthReport) -> Iterator[str]:
         f"compared with the truth, seconds {truth.start_s:.1f} to {truth.stop_s:.1f}:"
         f" {truth.rows} states over {truth.distance_m:.0f} m"
     )
+    angles = {"heading": heading, "pitch": truth.pitch, "roll": truth.roll}
     yield from table(
         [
-            ["", "RMSE", "95 % below", "unit", ""],
-            ["  horizontal position", f"{position.rmse_m:.3f}", f"{position.p95_m:.3f}", "m", ""],
-            ["    mean offset removed", f"{position.rmse_offset_removed_m:.3f}", "", "m", f"offset {offset:.3f} m"],
-            ["  height", f"{truth.height_rmse_m:.3f}", "", "m", ""],
-            ["  horizontal velocity", f"{truth.velocity_rmse_mps:.3f}", f"{truth.velocity_p95_mps:.3f}", "m/s", ""],
+            ["", "RMSE", "68 % below", "95 % below", "unit", ""],
+            ["  horizontal position", *_cells(position.rmse_m, position.p68_m, position.p95_m), "m", ""],
+            ["    mean offset removed", f"{position.rmse_offset_removed_m:.3f}", "", "", "m", f"offset {offset:.3f} m"],
+            ["  height", f"{truth.height_rmse_m:.3f}", "", "", "m", ""],
             [
-                "  heading, mean offset removed",
-                f"{heading.rmse_deg:.3f}",
-                f"{heading.p95_deg:.3f}",
-                "deg",
-                f"offset {heading.offset_deg:.3f} deg",
+                "  horizontal velocity",
+                *_cells(truth.velocity_rmse_mps, truth.velocity_p68_mps, truth.velocity_p95_mps),
+                "m/s",
+                "",
             ],
+            *(_angle(name, angle) for name, angle in angles.items() if angle),
         ]
     )
     share = position.end_m / truth.distance_m if truth.distance_m else 0.0
     yield f"  error at the end {position.end_m:.2f} m, {100 * share:.2f} % of the distance; max {position.max_m:.2f} m"
     yield f"  {100 * position.inside_95:.1f} % of the states have the truth inside their 95 % ellipse (should be 95 or more)"
+
+
+def _cells(*values: float) -> list[str]:
+    return [f"{value:.3f}" for value in values]
+
+
+def _angle(name: str, angle: AngleReport) -> list[str]:
+    cells = _cells(angle.rmse_deg, angle.p68_deg, angle.p95_deg)
+    return [f"  {name}, mean offset removed", *cells, "deg", f"offset {angle.offset_deg:.3f} deg"]
+
+
+def _outages(found: OutageReport) -> Iterator[str]:
+    yield (
+        f"without GNSS for {found.length}, {found.count} times: 68 % of the errors at the end are at most"
+        f" {found.p68_percent:.2f} % of the distance ({found.p68_m:.2f} m)"
+    )
+    yield f"  median {found.p50_percent:.2f} %, 95 % below {found.p95_percent:.2f} %, worst {found.max_percent:.2f} %"
+    yield f"  {100 * found.inside_95:.0f} % of the ends have the truth inside their 95 % ellipse"
+    if found.without_state:
+        yield f"  {found.without_state} more outages ended without a state, or where no truth is known"

@@ -27,21 +27,25 @@ class TruthSample(NamedTuple):
     vn_mps: float
     ve_mps: float
     yaw_deg: float
+    pitch_deg: float = math.nan  # not a number where the track does not tell
+    roll_deg: float = math.nan
 
 
-TRUTH_COLUMNS = ("unix_us", *TruthSample._fields[1:])
-LIMITS_DEG = {"lat_deg": 90.0, "lon_deg": 180.0, "yaw_deg": 360.0}
+TRUTH_COLUMNS = ("unix_us", "lat_deg", "lon_deg", "height_m", "vn_mps", "ve_mps", "yaw_deg")
+LEVEL_COLUMNS = ("pitch_deg", "roll_deg")  # a track may have both
+LIMITS_DEG = {"lat_deg": 90.0, "lon_deg": 180.0, "yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 
 
 def parse_truth(lines: Iterable[str], name: str) -> Iterator[TruthSample]:
-    """The samples of a truth CSV: a header with at least TRUTH_COLUMNS, then lines of rising unix_us. Other columns are
-    ignored. `name` is the file's, for messages. Raises TruthError."""
+    """The samples of a truth CSV: a header with at least TRUTH_COLUMNS, then lines of rising unix_us. Columns other than
+    those and LEVEL_COLUMNS are ignored. `name` is the file's, for messages. Raises TruthError."""
     numbered = enumerate(lines, 1)
     header = [column.strip() for column in next(numbered, (1, ""))[1].removeprefix("\ufeff").split(",")]
     missing = [column for column in TRUTH_COLUMNS if column not in header]
     if missing:
         raise TruthError(f"{name}:1: no column {', '.join(missing)}; a truth needs {', '.join(TRUTH_COLUMNS)}")
-    places = [header.index(column) for column in TRUTH_COLUMNS]
+    columns = TRUTH_COLUMNS + (LEVEL_COLUMNS if all(column in header for column in LEVEL_COLUMNS) else ())
+    places = [header.index(column) for column in columns]
     last_ns: int | None = None
     for number, line in numbered:
         if not line.strip():
@@ -63,7 +67,7 @@ def _sample(cells: list[str], where: str) -> TruthSample:
     if not (cells[0].isascii() and cells[0].isdigit()):
         raise TruthError(f"{where}: unix_us: '{cells[0]}' is not a whole number of microseconds")
     numbers = []
-    for column, cell in zip(TRUTH_COLUMNS[1:], cells[1:], strict=True):
+    for column, cell in zip((*TRUTH_COLUMNS, *LEVEL_COLUMNS)[1:], cells[1:], strict=False):
         try:
             number = float(cell)
         except ValueError:
@@ -80,6 +84,10 @@ class Truth:
     def __init__(self, samples: Iterable[TruthSample]) -> None:
         self._all = samples
         self._begin()
+
+    def __iter__(self) -> Iterator[TruthSample]:
+        """All samples, from the first on."""
+        return iter(self._all)
 
     def _begin(self) -> None:
         self._samples = iter(self._all)
@@ -110,6 +118,8 @@ class Truth:
             between(before.vn_mps, after.vn_mps),
             between(before.ve_mps, after.ve_mps),
             before.yaw_deg + share * wrapped(after.yaw_deg - before.yaw_deg),
+            between(before.pitch_deg, after.pitch_deg),
+            before.roll_deg + share * wrapped(after.roll_deg - before.roll_deg),
         )
 
 

@@ -59,6 +59,8 @@ def test_comparison_gives_numpys_figures(offset_deg: float) -> None:
     assert found.position.rmse_m == pytest.approx(np.sqrt(np.mean(horizontal**2)))
     assert found.position.rmse_offset_removed_m == pytest.approx(np.sqrt(np.mean(centred**2)))
     assert found.position.p95_m == pytest.approx(np.quantile(horizontal, 0.95, method="inverted_cdf"), abs=6e-4)
+    assert found.position.p68_m == pytest.approx(np.quantile(horizontal, 0.68, method="inverted_cdf"), abs=6e-4)
+    assert found.velocity_p68_mps == pytest.approx(np.quantile(speed[here], 0.68, method="inverted_cdf"), abs=6e-4)
     assert found.position.max_m == horizontal.max()
     assert found.position.end_m == horizontal[-1]
     assert found.position.inside_95 == pytest.approx((nees[here] <= 5.991).mean())
@@ -68,5 +70,26 @@ def test_comparison_gives_numpys_figures(offset_deg: float) -> None:
     turned = yaw[here] - yaw[here].mean()
     assert found.heading.rmse_deg == pytest.approx(turned.std(), rel=1e-6)
     assert found.heading.p95_deg == pytest.approx(np.quantile(np.abs(turned), 0.95, method="inverted_cdf"), abs=2e-3)
+    assert found.heading.p68_deg == pytest.approx(np.quantile(np.abs(turned), 0.68, method="inverted_cdf"), abs=2e-3)
+    assert found.pitch is None  # the truth has none
     off = (found.heading.offset_deg - offset_deg - yaw[here].mean() + 180) % 360 - 180
     assert off == pytest.approx(0.0, abs=1e-9)
+
+
+def test_pitch_and_roll_are_compared_where_the_truth_has_them() -> None:
+    state = message().state
+    assert state is not None
+    for pitch, roll, told in ((1.0, -2.0, True), (0.0, 0.0, False)):  # zeros: a track that does not tell
+        comparison = Comparison()
+        for k in range(10):
+            errors = errors_of(message(), HERE._replace(pitch_deg=pitch + 0.1 * k if told else 0.0, roll_deg=roll))
+            assert errors is not None
+            comparison.add(k * SECOND, errors)
+        found = comparison.report()
+        assert found is not None
+        assert (found.pitch is not None, found.roll is not None) == (told, told)
+        if found.pitch and found.roll:
+            assert found.pitch.offset_deg == pytest.approx(state.pitch_deg - 1.45)
+            assert found.pitch.rmse_deg == pytest.approx(np.std(0.1 * np.arange(10)))
+            assert found.roll.offset_deg == pytest.approx(state.roll_deg + 2.0)
+            assert found.roll.rmse_deg == pytest.approx(0.0, abs=1e-9)
