@@ -28,6 +28,7 @@ from benchmarks.study import (
     reckoning,
     rover,
     rtk,
+    smoothing,
 )
 from benchmarks.study.report import Section, save
 from fusiond import __version__
@@ -49,6 +50,7 @@ PARTS: dict[str, tuple[Callable[[int, int], Section], int]] = {  # and the numbe
     "rtk": (rtk.rtk, 10),
     "rover": (rover.rover, 20),
     "delay": (delay.delay, 10),
+    "smoothing": (smoothing.smoothing, 24),
 }
 
 

@@ -46,6 +46,7 @@ from fusiond.filter.state import (
     Verdict,
 )
 from fusiond.filter.stored_state import StoredState, check, stored_state
+from fusiond.maths.typed import Array
 from fusiond.timeline.clock import Clock
 from fusiond.units import SECOND, nanoseconds
 
@@ -117,6 +118,7 @@ class Fusion:
         """Begin anew on a time line that has stepped back: clocks and state align again; biases, calibrations and counts
         are kept."""
         self.clock.forget()
+        self.history.finish()
         self.history = self.history.next_session()
         self._first_ns = None
 
@@ -213,12 +215,18 @@ def imu_values(sample: ImuSample, imu: Imu) -> tuple[float, ...]:
 
 def solution_state(state: FilterState, kernel: AnyKernel) -> SolutionState:
     """A filter state after alignment, in north-east-down, for publication."""
-    x, auxiliary = state.nominal, state.auxiliary
-    numbers = kernel.to_north_east_down(x, state.covariance)
-    published, nominal = numbers[: COVARIANCE_N.start].tolist(), x.tolist()
-    rate, force = auxiliary[RATE_B].tolist(), auxiliary[FORCE_B].tolist()
+    numbers = kernel.to_north_east_down(state.nominal, state.covariance)
+    variances, auxiliary = state.covariance.diagonal(), state.auxiliary
+    return to_solution(state.nominal, numbers, variances, auxiliary[RATE_B], auxiliary[FORCE_B])
+
+
+def to_solution(nominal_e: Array, state_n: Array, variances: Array, rate_b: Array, force_b: Array) -> SolutionState:
+    """A state for publication from its numbers: nominal, in north-east-down, variances (n,) of the error state, angular rate
+    (3,) [rad/s] and specific force (3,) [m/s^2], bias included."""
+    published, nominal = state_n[: COVARIANCE_N.start].tolist(), nominal_e.tolist()
+    rate, force = rate_b.tolist(), force_b.tolist()
     gyro_bias, accel_bias = nominal[GYRO_BIAS_B], nominal[ACCEL_BIAS_B]
-    sigma = [math.sqrt(max(variance, 0.0)) for variance in state.covariance.diagonal().tolist()]
+    sigma = [math.sqrt(max(variance, 0.0)) for variance in variances.tolist()]
     return SolutionState(
         latitude=published[0],
         longitude=published[1],
@@ -231,7 +239,7 @@ def solution_state(state: FilterState, kernel: AnyKernel) -> SolutionState:
         accel_bias=_three(accel_bias),
         wheel_scale=nominal[WHEEL_SCALE.start],
         mount=(nominal[MOUNT.start], nominal[MOUNT.start + 1]),
-        covariance=numbers[COVARIANCE_N].reshape(COVARIANCE_SIZE, COVARIANCE_SIZE),
+        covariance=state_n[COVARIANCE_N].reshape(COVARIANCE_SIZE, COVARIANCE_SIZE),
         sigma_gyro_bias=_three(sigma[GYRO_BIAS]),
         sigma_accel_bias=_three(sigma[ACCEL_BIAS]),
         sigma_wheel_scale=sigma[SCALE.start],

@@ -16,6 +16,8 @@ newest event, so that the filter coasts on with its other sensors.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,12 +26,15 @@ from fusiond.filter.kernel.interpreted import keep, make_kernel
 from fusiond.filter.observations import IMU
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import ROW, Outcome, Rows
-from fusiond.filter.state import NEVER, FilterState
+from fusiond.filter.state import NEVER, PHASE, RUNNING, FilterState
 from fusiond.filter.step import begin_session, run_one
 
 FIRST_ROWS = 4096
 FIRST_SNAPSHOTS = 64
+Archive = Callable[[Rows, FilterState], None]  # rows that no event can change any more, and the state after them
+
 FORGET_EVERY = 256  # events; at most this many are run at once
+FORGET_WHILE_STARTING = 8  # where an archive wants to know the state as soon as there is one
 
 
 class History:
@@ -40,6 +45,7 @@ class History:
         self._compiled = compiled
         self.kernel = make_kernel(params, compiled)
         self.index = {source: i for i, source in enumerate(params.sources)}
+        self.archive: Archive | None = None  # gets every row that is run, in order, before it is forgotten
         self.rerun = 0  # rows run again because of a late event
         self.applied_ns = NEVER  # events up to here are applied; it depends on the received stamps alone
         self.settled_ns = NEVER - params.horizon_ns  # the horizon: an older event is TOO_OLD
@@ -63,7 +69,7 @@ class History:
         begin_session(following._head)
         following._snapshots = Snapshots(following._head)
         following._counts[:] = self.counts
-        following.rerun = self.rerun
+        following.rerun, following.archive = self.rerun, self.archive
         following._attach()
         return following
 
@@ -133,6 +139,12 @@ class History:
         self._forget()
         return self._snapshots.first()
 
+    def finish(self) -> None:
+        """Hand all that was run and is not yet forgotten to the archive: no event will come any more."""
+        self._forget()
+        if self.archive and self._applied:
+            self.archive(self._table[self._begin : self._begin + self._applied], self._head.copy())
+
     def _rewind(self, first_changed: int) -> None:
         """Drop the snapshots that contain a changed row, so that the rows after the newest one left are run again."""
         before, self._applied = self._applied, self._snapshots.rewind(first_changed)
@@ -173,8 +185,11 @@ class History:
     def _forget(self) -> None:
         """Drop the rows and snapshots that no event inside the horizon can need. The results do not depend on when."""
         self.apply_rows()
-        self._until_forgetting = FORGET_EVERY
+        starting = self.archive and self._snapshots.whole[self._snapshots.begin, PHASE] != RUNNING
+        self._until_forgetting = FORGET_WHILE_STARTING if starting else FORGET_EVERY
         gone = self._snapshots.forget(self._table["t_ns"][self._begin : self._end], self.settled_ns)
+        if self.archive and gone:
+            self.archive(self._table[self._begin : self._begin + gone], self._snapshots.first())
         self._begin += gone
         self._applied -= gone
 

@@ -63,6 +63,9 @@ def carry(state: FilterState, source: int, values: Vector, params: Parameters) -
         p[GNSS_ERROR.start + i] *= kept
     for i in range(3):
         p[:, GNSS_ERROR.start + i] *= kept
+    if state.tracked:
+        for i in range(3):
+            state.transition[GNSS_ERROR.start + i] *= kept
     factor = noise_factor(state.memory[source], parameter[NOISE_MIN], parameter[NOISE_MAX])
     new = factor * parameter[SLOW_SHARE] * (1 - kept * kept)
     to_n = mat_ne(x[POSITION_E])

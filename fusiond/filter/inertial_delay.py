@@ -41,3 +41,7 @@ def catch_up(state: FilterState, force_change: Vector3, rate_change: Vector3) ->
     for i in range(3):
         p[:, VELOCITY.start + i] += pushed_e[i] * p[:, accel]
         p[:, ATTITUDE.start + i] += turned_e[i] * p[:, gyro]
+    if state.tracked:
+        for i in range(3):
+            state.transition[VELOCITY.start + i] += pushed_e[i] * state.transition[accel]
+            state.transition[ATTITUDE.start + i] += turned_e[i] * state.transition[gyro]

@@ -147,13 +147,13 @@ def update_projected(
         if share < NEGLIGIBLE:
             return ratio, False
     gain = np.empty((3, state.size))
-    if not _make_gain(p, seen, factor, given, across, spread, gain):
+    if not make_gain(p, seen, factor, given, across, spread, gain):
         return ratio, False
     before = np.empty((state.size, state.size))
     if share < 1:
         for i in range(state.size):
             before[i] = p[i]
-    _joseph(p, seen, factor, across, gain)
+    joseph(p, seen, factor, across, gain)
     error = np.zeros(state.size)
     for a in range(m):
         error += seen.innovation[a] * gain[a]
@@ -168,7 +168,7 @@ def update_projected(
 
 
 @compiled
-def _make_gain(
+def make_gain(
     p: Covariance,
     seen: Observation,
     factor: float,
@@ -229,7 +229,7 @@ def give_scale(p: Covariance, m: int, across: ErrorRows3, spread: Matrix3) -> No
 
 
 @compiled
-def _joseph(p: Covariance, seen: Observation, factor: float, across: ErrorRows3, gain: ErrorRows3) -> None:
+def joseph(p: Covariance, seen: Observation, factor: float, across: ErrorRows3, gain: ErrorRows3) -> None:
     """P = (I - K H) P (I - K H)' + K R K', as A = P - K (H P) and P = A - (A H') K' + K R K', by rows."""
     for a in range(seen.m):
         p += (-across[a])[:, None] * gain[a]  # of A' = P - (P H') K'
@@ -256,14 +256,8 @@ def turn_along(p: Covariance, error: ErrorVector) -> None:
     heading that nothing observes stays as uncertain as it is. Without this each correction of the velocity would turn the
     direction in which the heading cannot be seen, and the filter would take that for knowledge.
     """
-    turned = np.empty((6, len(p)))
     phi = ATTITUDE.start
-    for block in range(0, 6, 3):  # position, velocity
-        turned[block] = error[block + 1] * p[phi + 2] - error[block + 2] * p[phi + 1]
-        turned[block + 1] = error[block + 2] * p[phi] - error[block] * p[phi + 2]
-        turned[block + 2] = error[block] * p[phi + 1] - error[block + 1] * p[phi]
-    for i in range(6):
-        p[i] += -1.0 * turned[i]
+    turn_rows(p, error)
     for block in range(0, 6, 3):
         for i in range(6):
             x, y, z = p[i, phi], p[i, phi + 1], p[i, phi + 2]
@@ -272,6 +266,19 @@ def turn_along(p: Covariance, error: ErrorVector) -> None:
             p[i, block + 2] -= error[block] * y - error[block + 1] * x
     for i in range(6):
         p[i:, i] = p[i, i:]
+
+
+@compiled
+def turn_rows(p: Covariance, error: ErrorVector) -> None:
+    """P = M P, the half of `turn_along` that acts on rows."""
+    turned = np.empty((6, len(p)))
+    phi = ATTITUDE.start
+    for block in range(0, 6, 3):  # position, velocity
+        turned[block] = error[block + 1] * p[phi + 2] - error[block + 2] * p[phi + 1]
+        turned[block + 1] = error[block + 2] * p[phi] - error[block] * p[phi + 2]
+        turned[block + 2] = error[block] * p[phi + 1] - error[block + 1] * p[phi]
+    for i in range(6):
+        p[i] += -1.0 * turned[i]
 
 
 @compiled

@@ -202,12 +202,16 @@ class FilterState:
         "size",
         "source_stamps",
         "stamps",
+        "tracked",
+        "transition",
         "whole",
     )
 
     def __init__(self, sources: int, size: int = ERROR_SIZE) -> None:
         """An empty state for a number of sources and of error states."""
         self.size = size
+        self.tracked = False  # whether `transition` is kept up: what has become of an error since that was the identity
+        self.transition: Array = np.empty((0, 0))
         block = 1 + NOMINAL_SIZE + size * size
         sizes = [NOMINAL_SIZE, size * size, AUXILIARY_SIZE, sources * MEMORY_SIZE, HYPOTHESES * block]
         ends = np.cumsum(sizes)
@@ -232,7 +236,7 @@ class FilterState:
         """A view of one hypothesis as a state: nominal and covariance are its own, the rest is shared."""
         view = FilterState.__new__(FilterState)
         view.size, view.numbers, view.whole, view.bank = self.size, self.numbers, self.whole, self.bank
-        view.core = self.core
+        view.core, view.tracked, view.transition = self.core, False, self.transition
         view.auxiliary, view.memory, view.stamps = self.auxiliary, self.memory, self.stamps
         view.source_stamps = self.source_stamps
         view.nominal = self.bank[number, 1 : 1 + NOMINAL_SIZE]
@@ -248,6 +252,10 @@ class FilterState:
             self.bank[:] = 0.0
         self.core[:] = other.core
         self.whole[:] = other.whole
+
+    def track(self) -> None:
+        """Keep up from now on what becomes of an error of this state: `transition` (n, n). No snapshot holds it."""
+        self.tracked, self.transition = True, np.eye(self.size)
 
     def fills_bank(self) -> bool:
         """Whether the bank holds hypotheses: of the heading, or rivals."""

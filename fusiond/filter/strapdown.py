@@ -37,7 +37,7 @@ from fusiond.filter.state import (
 from fusiond.maths.linear import mirror
 from fusiond.maths.portable import exp, square
 from fusiond.maths.rotation import cross, matrix, normalised, quaternion_exp, quaternion_multiply, times, transposed_times
-from fusiond.maths.typed import Covariance, Matrix3, Vector3, compiled
+from fusiond.maths.typed import Covariance, ErrorRows6, ErrorRows9, Matrix3, Transition, Vector3, compiled
 from fusiond.maths.wgs84 import EARTH_RATE, MU, gravity_e
 
 COAST_ACCEL = 2.0  # m/s^2/sqrt(Hz): what a vehicle may do while the inertial sensor is silent
@@ -99,6 +99,8 @@ def _step(state: FilterState, dt: float, force_b: Vector3, rate_b: Vector3, nois
     turned = quaternion_multiply(quaternion_exp(earth_turn), quaternion_multiply(x[QUATERNION_EB], quaternion_exp(turn)))
     x[QUATERNION_EB] = normalised(turned)
     _grow(state.covariance, dt, force_e, mat_eb, gradient)
+    if state.tracked:
+        _follow(state.transition, dt, force_e, mat_eb, gradient)
     doubt = x[INERTIAL_DOUBT]
     _add_noise(state.covariance, dt, noise.accel + doubt * DOUBT_ACCEL, noise.gyro + doubt * DOUBT_GYRO, noise)
     if doubt > 0:
@@ -129,24 +131,8 @@ def _grow(p: Covariance, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient:
     """
     c, f = mat_eb, force_e
     half_dt2, earth_turn = dt * dt / 2, EARTH_RATE * dt
-    by_gyro, by_force = np.empty((3, len(p))), np.empty((3, len(p)))  # C b_g; C b_a + f_e x phi
     rows = np.empty((9, len(p)))
-    for i in range(3):
-        by_gyro[i] = c[i, 0] * p[9] + c[i, 1] * p[10] + c[i, 2] * p[11]
-        by_force[i] = c[i, 0] * p[12] + c[i, 1] * p[13] + c[i, 2] * p[14]
-    by_force[0] += f[1] * p[8] - f[2] * p[7]
-    by_force[1] += f[2] * p[6] - f[0] * p[8]
-    by_force[2] += f[0] * p[7] - f[1] * p[6]
-    for i in range(3):
-        rows[i] = p[i] + dt * p[3 + i] - half_dt2 * by_force[i]
-        pulled = gradient[i]
-        rows[3 + i] = p[3 + i] - dt * by_force[i] + dt * (pulled[0] * p[0] + pulled[1] * p[1] + pulled[2] * p[2])
-        rows[6 + i] = p[6 + i] - dt * by_gyro[i]
-    rows[3] += half_dt2 * (f[1] * by_gyro[2] - f[2] * by_gyro[1]) + 2 * earth_turn * p[4]
-    rows[4] += half_dt2 * (f[2] * by_gyro[0] - f[0] * by_gyro[2]) - 2 * earth_turn * p[3]
-    rows[5] += half_dt2 * (f[0] * by_gyro[1] - f[1] * by_gyro[0])
-    rows[6] += earth_turn * p[7]
-    rows[7] -= earth_turn * p[6]
+    _move_rows(p, dt, f, c, gradient, rows)
 
     turned, felt = np.empty((3, 9)), np.empty((3, 9))  # the same two, of the columns
     corner = np.empty((9, 9))
@@ -174,6 +160,41 @@ def _grow(p: Covariance, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient:
         p[i : CORNER.stop, i] = corner[i:, i]
         p[i, CORNER.stop :] = rows[i, CORNER.stop :]
         p[CORNER.stop :, i] = rows[i, CORNER.stop :]
+
+
+@compiled
+def _follow(a: Transition, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient: Matrix3) -> None:
+    """A = Phi A for the same transition."""
+    rows = np.empty((9, len(a)))
+    _move_rows(a, dt, force_e, mat_eb, gradient, rows)
+    for i in range(9):
+        a[i] = rows[i]
+
+
+@compiled
+def _move_rows(
+    p: Covariance, dt: float, force_e: Vector3, mat_eb: Matrix3, gradient: Matrix3, rows: ErrorRows9
+) -> None:
+    """Write the first nine rows of Phi P, which alone change, into `rows`."""
+    c, f = mat_eb, force_e
+    half_dt2, earth_turn = dt * dt / 2, EARTH_RATE * dt
+    by_gyro, by_force = np.empty((3, len(p))), np.empty((3, len(p)))  # C b_g; C b_a + f_e x phi
+    for i in range(3):
+        by_gyro[i] = c[i, 0] * p[9] + c[i, 1] * p[10] + c[i, 2] * p[11]
+        by_force[i] = c[i, 0] * p[12] + c[i, 1] * p[13] + c[i, 2] * p[14]
+    by_force[0] += f[1] * p[8] - f[2] * p[7]
+    by_force[1] += f[2] * p[6] - f[0] * p[8]
+    by_force[2] += f[0] * p[7] - f[1] * p[6]
+    for i in range(3):
+        rows[i] = p[i] + dt * p[3 + i] - half_dt2 * by_force[i]
+        pulled = gradient[i]
+        rows[3 + i] = p[3 + i] - dt * by_force[i] + dt * (pulled[0] * p[0] + pulled[1] * p[1] + pulled[2] * p[2])
+        rows[6 + i] = p[6 + i] - dt * by_gyro[i]
+    rows[3] += half_dt2 * (f[1] * by_gyro[2] - f[2] * by_gyro[1]) + 2 * earth_turn * p[4]
+    rows[4] += half_dt2 * (f[2] * by_gyro[0] - f[0] * by_gyro[2]) - 2 * earth_turn * p[3]
+    rows[5] += half_dt2 * (f[0] * by_gyro[1] - f[1] * by_gyro[0])
+    rows[6] += earth_turn * p[7]
+    rows[7] -= earth_turn * p[6]
 
 
 @compiled
@@ -221,6 +242,9 @@ def _coast(state: FilterState, dt: float, noise: ProcessNoise, rests: bool) -> N
     for i in range(3):
         p[:, i] += dt * p[:, VELOCITY.start + i]
     mirror(p)
+    if state.tracked:
+        for i in range(3):
+            state.transition[i] += dt * state.transition[VELOCITY.start + i]
     _add_noise(p, dt, 0.0 if rests else square(COAST_ACCEL), square(COAST_TILT), noise)
     if rests:
         return
@@ -275,6 +299,9 @@ def end_coasting(state: FilterState) -> None:
     for i in range(3):
         for j in range(3):
             p[bias + i, bias + j] = a[KEPT_BIAS_COVARIANCE.start + 3 * i + j]
+    if state.tracked:
+        for i in range(3):
+            state.transition[bias + i] = 0.0
 
 
 @compiled
@@ -293,13 +320,13 @@ def _turn(state: FilterState, dt: float, up_e: Vector3) -> None:
     x[QUATERNION_EB] = normalised(quaternion_multiply(turn, x[QUATERNION_EB]))
     sideways_e = cross(up_e, x[VELOCITY_E])
     rows = np.empty((6, len(p)))
-    by_rate = up_b[0] * p[bias] + up_b[1] * p[bias + 1] + up_b[2] * p[bias + 2]
-    for i in range(3):
-        along, across = -dt * sideways_e[i], -dt * up_e[i]
-        rows[i] = mat[i, 0] * p[3] + mat[i, 1] * p[4] + mat[i, 2] * p[5] + along * by_rate
-        rows[3 + i] = mat[i, 0] * p[6] + mat[i, 1] * p[7] + mat[i, 2] * p[8] + across * by_rate
+    _turn_rows(p, dt, mat, up_e, up_b, sideways_e, rows)
     for i in range(6):
         p[3 + i] = rows[i]
+    if state.tracked:
+        _turn_rows(state.transition, dt, mat, up_e, up_b, sideways_e, rows)
+        for i in range(6):
+            state.transition[3 + i] = rows[i]
     columns = np.empty((6, len(p)))
     by_rate = up_b[0] * p[:, bias] + up_b[1] * p[:, bias + 1] + up_b[2] * p[:, bias + 2]
     for i in range(3):
@@ -313,8 +340,25 @@ def _turn(state: FilterState, dt: float, up_e: Vector3) -> None:
         p[bias + i] *= kept
     for i in range(3):
         p[:, bias + i] *= kept
+    if state.tracked:
+        for i in range(3):
+            state.transition[bias + i] *= kept
     fresh = square(TURN_RATE) * (1 - kept * kept)
     for i in range(3):
         a[RATE_B.start + i] = x[GYRO_BIAS_B.start + i] + speed * kept * up_b[i]
         for j in range(3):
             p[bias + i, bias + j] += fresh * up_b[i] * up_b[j]
+
+
+@compiled
+def _turn_rows(
+    p: Covariance, dt: float, mat: Matrix3, up_e: Vector3, up_b: Vector3, sideways_e: Vector3, rows: ErrorRows6
+) -> None:
+    """Write the rows of velocity and attitude of Phi P, for the transition Phi of a turn (3, 3) at the rate that is
+    estimated, into `rows`."""
+    bias = GYRO_BIAS.start
+    by_rate = up_b[0] * p[bias] + up_b[1] * p[bias + 1] + up_b[2] * p[bias + 2]
+    for i in range(3):
+        along, across = -dt * sideways_e[i], -dt * up_e[i]
+        rows[i] = mat[i, 0] * p[3] + mat[i, 1] * p[4] + mat[i, 2] * p[5] + along * by_rate
+        rows[3 + i] = mat[i, 0] * p[6] + mat[i, 1] * p[7] + mat[i, 2] * p[8] + across * by_rate

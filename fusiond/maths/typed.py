@@ -20,7 +20,10 @@ Matrix3 = Array  # (3, 3)
 StateN = Array  # (91,), see fusiond.filter.north_east_down
 ErrorVector = Array  # (n,), n error states
 ErrorRows3 = Array  # (3, n): room for the rows of up to three axes
+ErrorRows6 = Array  # (6, n)
+ErrorRows9 = Array  # (9, n)
 Covariance = Array  # (n, n), symmetric
+Transition = Array  # (n, n), what an error becomes
 Stamps = NDArray[np.int64]  # (k,), ns or counts
 
 Any_ = TypeVar("Any_", bound=Callable[..., object])

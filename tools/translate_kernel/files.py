@@ -21,6 +21,7 @@ SIZES = {  # constants that the structs and the kernel's class need by name, and
     "fusiond.filter.observations.model": ("VALUES", "PARAMETERS"),
     "fusiond.filter.observations": ("IMU",),
     "fusiond.filter.north_east_down": ("STATE_N_SIZE",),
+    "fusiond.filter.smoothing": ("PARTS", "LINKS"),
 }  # fmt: skip  # fmt: skip
 HEAD = """\
 # Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
@@ -60,7 +61,7 @@ def layout() -> str:
         found = importlib.import_module(module)
         lines += [f"    {name} = {int(getattr(found, name))}" for name in names]
     lines += ["    BLOCK = 1 + NOMINAL_SIZE + n * n  # numbers of a hypothesis: weight, nominal, covariance", ""]
-    for struct in ("Noise", "Observation", "Row", "State", "Parameters"):
+    for struct in ("Noise", "Observation", "Link", "Row", "State", "Parameters"):
         lines.append(f"cdef struct {struct}:")
         for name, kind in FIELDS[struct].items():
             if struct == "Row" and name in ("source", "outcome"):

@@ -59,7 +59,10 @@ KINDS = {  # annotations
     "Matrix3": matrix("3", "3"),
     "ErrorVector": vector("n"),
     "ErrorRows3": matrix("3", "n"),
+    "ErrorRows6": matrix("6", "n"),
+    "ErrorRows9": matrix("9", "n"),
     "Covariance": matrix("n", "n"),
+    "Transition": matrix("n", "n"),
     "StateN": vector("STATE_N_SIZE"),
     "Stamps": vector(of="int64_t"),
     "FilterState": Kind("pointer", "State"),
@@ -69,6 +72,8 @@ KINDS = {  # annotations
     "Row": Kind("pointer", "Row"),
     "Row | None": Kind("pointer", "Row"),
     "Rows": Kind("pointer", "Row", size="rows"),
+    "Link": Kind("pointer", "Link"),
+    "Links": Kind("pointer", "Link", size="rows"),
 }
 FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
     "State": {
@@ -81,6 +86,8 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "source_stamps": matrix("", "SOURCE_STAMPS_SIZE", "int64_t"),
         "size": INT,
         "sources": INT,
+        "transition": matrix("n", "n"),
+        "tracked": BOOL,
     },
     "Noise": {
         "accel": FLOAT,
@@ -95,6 +102,20 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "jacobian": matrix("3", "n"),
         "variance": vector("3"),
         "common": vector("3"),
+    },
+    "Link": {
+        "row": INT,
+        "part": INT,
+        "m": INT,
+        "fused": BOOL,
+        "weight": FLOAT,
+        "innovation": vector("3"),
+        "variance": vector("3"),
+        "spread": matrix("3", "3"),
+        "sight": matrix("3", "n"),
+        "across": matrix("3", "n"),
+        "gain": matrix("3", "n"),
+        "transition": matrix("n", "n"),
     },
     "Row": {
         "t_ns": INT,

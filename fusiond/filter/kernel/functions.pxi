@@ -410,6 +410,10 @@ cdef void gnss_error_carry(State* state, int64_t source, double* values, Paramet
     for i in range(3):
         for _i in range(n):
             (p + (18 + i))[_i * n] *= kept
+    if state.tracked:
+        for i in range(3):
+            for _i in range(n):
+                (state.transition + ((18 + i)) * n)[_i] *= kept
     factor = source_health_noise_factor(state.memory + (source) * MEMORY_SIZE, parameter[8], parameter[9])
     new = ((factor * parameter[7]) * (1 - (kept * kept)))
     wgs84_mat_ne(x, to_n)
@@ -879,6 +883,10 @@ cdef void inertial_delay_catch_up(State* state, double* force_change, double* ra
         _t7 = turned_e[i]
         for _i in range(n):
             (p + (6 + i))[_i * n] += (_t7 * (p + gyro)[_i * n])
+    if state.tracked:
+        for i in range(3):
+            axpy(state.transition + ((3 + i)) * n, pushed_e[i], state.transition + (accel) * n)
+            axpy(state.transition + ((6 + i)) * n, turned_e[i], state.transition + (gyro) * n)
 
 # ---------------- fusiond.filter.inertial_sample
 
@@ -1685,13 +1693,13 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
         share = measurement_update_detection(distance, m, clutter)
         if (share < 1e-06):
             return (ratio, False)
-    if (not measurement_update__make_gain(p, seen, factor, given, across, spread, gain)):
+    if (not measurement_update_make_gain(p, seen, factor, given, across, spread, gain)):
         return (ratio, False)
     if (share < 1):
         for i in range(n):
             for _i in range(n):
                 (before + (i) * n)[_i] = (p + (i) * n)[_i]
-    measurement_update__joseph(p, seen, factor, across, gain)
+    measurement_update_joseph(p, seen, factor, across, gain)
     memset(error, 0, n * sizeof(double))
     for a in range(m):
         axpy(error, seen.innovation[a], gain + (a) * n)
@@ -1708,7 +1716,7 @@ cdef (double, bint) measurement_update_update_projected(State* state, Observatio
     measurement_update_inject(state, error)
     return (ratio, (share >= 0.5))
 
-cdef bint measurement_update__make_gain(double* p, Observation* seen, double factor, bint given, double* across, double* spread, double* gain) noexcept nogil:
+cdef bint measurement_update_make_gain(double* p, Observation* seen, double factor, bint given, double* across, double* spread, double* gain) noexcept nogil:
     cdef double weighed[3 * 3]
     cdef double lower[3 * 3]
     cdef int64_t a
@@ -1760,7 +1768,7 @@ cdef void measurement_update_give_scale(double* p, int64_t m, double* across, do
         for i in range(m):
             spread[(a) * 3 + i] -= ((by[a] * by[i]) / variance)
 
-cdef void measurement_update__joseph(double* p, Observation* seen, double factor, double* across, double* gain) noexcept nogil:
+cdef void measurement_update_joseph(double* p, Observation* seen, double factor, double* across, double* gain) noexcept nogil:
     cdef int64_t a
     cdef int _i
     cdef double kept[3 * n]
@@ -1784,6 +1792,26 @@ cdef void measurement_update__joseph(double* p, Observation* seen, double factor
     linear_mirror(p)
 
 cdef void measurement_update_turn_along(double* p, double* error) noexcept nogil:
+    cdef int64_t phi
+    cdef int64_t block
+    cdef int64_t i
+    cdef double x
+    cdef double y
+    cdef double z
+    cdef int _i
+    phi = 6
+    measurement_update_turn_rows(p, error)
+    for block in range(0, 6, 3):
+        for i in range(6):
+            x, y, z = p[(i) * n + phi], p[(i) * n + (phi + 1)], p[(i) * n + (phi + 2)]
+            p[(i) * n + block] -= ((error[(block + 1)] * z) - (error[(block + 2)] * y))
+            p[(i) * n + (block + 1)] -= ((error[(block + 2)] * x) - (error[block] * z))
+            p[(i) * n + (block + 2)] -= ((error[block] * y) - (error[(block + 1)] * x))
+    for i in range(6):
+        for _i in range((n - i)):
+            (p + i + (i) * n)[_i * n] = (p + (i) * n + i)[_i]
+
+cdef void measurement_update_turn_rows(double* p, double* error) noexcept nogil:
     cdef double turned[6 * n]
     cdef int64_t phi
     cdef int64_t block
@@ -1795,9 +1823,6 @@ cdef void measurement_update_turn_along(double* p, double* error) noexcept nogil
     cdef double _t5
     cdef double _t6
     cdef int64_t i
-    cdef double x
-    cdef double y
-    cdef double z
     phi = 6
     for block in range(0, 6, 3):
         _t1 = error[(block + 1)]
@@ -1814,15 +1839,6 @@ cdef void measurement_update_turn_along(double* p, double* error) noexcept nogil
             (turned + ((block + 2)) * n)[_i] = ((_t5 * (p + ((phi + 1)) * n)[_i]) - (_t6 * (p + (phi) * n)[_i]))
     for i in range(6):
         axpy(p + (i) * n, (-1.0), turned + (i) * n)
-    for block in range(0, 6, 3):
-        for i in range(6):
-            x, y, z = p[(i) * n + phi], p[(i) * n + (phi + 1)], p[(i) * n + (phi + 2)]
-            p[(i) * n + block] -= ((error[(block + 1)] * z) - (error[(block + 2)] * y))
-            p[(i) * n + (block + 1)] -= ((error[(block + 2)] * x) - (error[block] * z))
-            p[(i) * n + (block + 2)] -= ((error[block] * y) - (error[(block + 1)] * x))
-    for i in range(6):
-        for _i in range((n - i)):
-            (p + i + (i) * n)[_i * n] = (p + (i) * n + i)[_i]
 
 cdef double measurement_update_detection(double distance, int64_t m, double clutter) noexcept nogil:
     cdef double density
@@ -3157,6 +3173,462 @@ cdef void rivals_mix(State* state) noexcept nogil:
     linear_mirror(p)
     measurement_update_inject(state, mean)
 
+# ---------------- fusiond.filter.smoothing
+
+cdef int64_t smoothing_follow(State* state, Row* rows, int64_t count, int64_t* judged, double* looks, Link* links, Parameters* params) noexcept nogil:
+    cdef int64_t _t1
+    cdef int64_t found
+    cdef int64_t following
+    cdef int64_t look
+    cdef int64_t i
+    cdef Row* row
+    cdef int64_t t_ns
+    cdef int64_t source
+    cdef bint coasted
+    cdef Row* imu
+    _t1 = 0
+    found = _t1
+    following = _t1
+    look = _t1
+    for i in range(count):
+        row = (rows + i)
+        following = (i if i > following else following)
+        while ((following < count) and (not smoothing__is_inertial((rows + following), params))):
+            following += 1
+        t_ns, source = (<int64_t>row.t_ns), (<int64_t>row.source)
+        coasted = step_coasts(state, t_ns, params)
+        imu = ((rows + following) if (following < count) else NULL)
+        step_advance(state, t_ns, imu, params)
+        if (source == -1):
+            smoothing__note_look(state, look, looks)
+            smoothing__begin_link(state, (links + found), i, -1)
+            look += 1
+            found += 1
+        elif (params.models[source] == -1):
+            step_keep_sample(state, row, params)
+            found += smoothing__constrain(state, i, True, judged, links, found, params)
+            state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
+        else:
+            found += smoothing__measure(state, row, i, judged, links, found, params)
+            state.source_stamps[(source) * SOURCE_STAMPS_SIZE + 0] = t_ns
+            if (coasted and (not motion_constraints_rests(state, params))):
+                found += smoothing__constrain(state, i, False, judged, links, found, params)
+        if (not state_is_sound(state)):
+            return -1
+    smoothing__begin_link(state, (links + found), count, -2)
+    return (found + 1)
+
+cdef bint smoothing__is_inertial(Row* row, Parameters* params) noexcept nogil:
+    cdef int64_t source
+    source = (<int64_t>row.source)
+    return ((source != -1) and (params.models[source] == -1))
+
+cdef void smoothing__note_look(State* state, int64_t look, double* looks) noexcept nogil:
+    cdef int64_t at
+    cdef int64_t k
+    cdef int64_t i
+    at = (look * ((35 + (n * n)) + 8))
+    for k in range(35):
+        looks[(at + k)] = state.nominal[k]
+    at += 35
+    for i in range(n):
+        for k in range(n):
+            looks[((at + (i * n)) + k)] = state.covariance[(i) * n + k]
+    at += (n * n)
+    for k in range(3):
+        looks[(at + k)] = state.auxiliary[(9 + k)]
+        looks[((at + 3) + k)] = state.auxiliary[(6 + k)]
+    looks[(at + 6)] = ((state.stamps[0] - state.stamps[1]) * 1e-09)
+    looks[(at + 7)] = ((state.stamps[0] - state.stamps[4]) * 1e-09)
+
+cdef void smoothing__begin_link(State* state, Link* link, int64_t row, int64_t part) noexcept nogil:
+    cdef int64_t i
+    cdef int _i
+    link.row, link.part, link.m, link.fused = row, part, 0, False
+    for i in range(n):
+        for _i in range(n):
+            (link.transition + (i) * n)[_i] = (state.transition + (i) * n)[_i]
+        for _i in range(n):
+            (state.transition + (i) * n)[_i] = 0.0
+        state.transition[(i) * n + i] = 1.0
+
+cdef int64_t smoothing__measure(State* state, Row* row, int64_t place, int64_t* judged, Link* links, int64_t found, Parameters* params) noexcept nogil:
+    cdef int64_t source
+    cdef int64_t t_ns
+    cdef int64_t model
+    cdef double* values
+    cdef double* parameter
+    cdef double* memory
+    cdef int64_t* stamps
+    cdef Observation seen
+    cdef double factor
+    cdef int64_t a
+    cdef double weight
+    cdef int _i
+    source, t_ns = (<int64_t>row.source), (<int64_t>row.t_ns)
+    model = params.models[source]
+    values = row.values
+    parameter = params.model_parameters + (source) * PARAMETERS
+    memory = state.memory + (source) * MEMORY_SIZE
+    stamps = state.source_stamps + (source) * SOURCE_STAMPS_SIZE
+    source_health_arrive(memory, stamps, values, t_ns)
+    measurement_remember(memory, model, values)
+    if (model == 0):
+        gnss_error_carry(state, source, values, params)
+        gnss_error_note(state, source, values, params)
+    if (not observations_observe(state, model, values, parameter, &seen)):
+        return 0
+    measurement_share_noise(state, &seen, parameter)
+    factor = source_health_noise_factor(memory, parameter[8], parameter[9])
+    for a in range(seen.m):
+        seen.variance[a] *= factor
+    if ((stamps[0] == (<int64_t>-4611686018427387904)) or ((t_ns - stamps[0]) > (<int64_t>10000000000))):
+        stamps[1] = (<int64_t>-4611686018427387904)
+    weight = measurement_factor_of(stamps, model, values, parameter, t_ns)
+    if (model == 0):
+        seen.m = 2
+    if smoothing__take(state, &seen, weight, judged[(3 * place)], place, 0, (links + found), params):
+        stamps[1] = t_ns
+        if (model == 0):
+            state.stamps[4] = t_ns
+    if (model != 0):
+        return 1
+    if (not observations_observe(state, model, values, parameter, &seen)):
+        return 1
+    measurement_share_noise(state, &seen, parameter)
+    seen.m = 1
+    for _i in range(n):
+        (seen.jacobian + (0) * n)[_i] = (seen.jacobian + (2) * n)[_i]
+    seen.innovation[0], seen.common[0], seen.variance[0] = seen.innovation[2], seen.common[2], (seen.variance[2] * factor)
+    smoothing__take(state, &seen, 1.0, judged[((3 * place) + 1)], place, 1, (links + (found + 1)), params)
+    return 2
+
+cdef int64_t smoothing__constrain(State* state, int64_t place, bint sensed, int64_t* judged, Link* links, int64_t found, Parameters* params) noexcept nogil:
+    cdef (bint, bint) _t1
+    cdef bint still
+    cdef bint rolling
+    cdef Observation seen
+    cdef bint taken
+    cdef bint stands
+    cdef int64_t made
+    _t1 = motion_constraints_constraints_due(state, params)
+    still = _t1[0]
+    rolling = _t1[1]
+    still = (still and sensed)
+    taken, stands, made = False, False, 0
+    if (still and motion_constraints_observe_constraint(state, 1, params, &seen)):
+        model_with_rate_noise(state, &seen)
+        stands = smoothing__take(state, &seen, params.zero_velocity_factor, judged[(3 * place)], place, 0, (links + found), params)
+        made = 1
+    if (stands and motion_constraints_observe_constraint(state, 2, params, &seen)):
+        model_with_rate_noise(state, &seen)
+        taken = smoothing__take(state, &seen, 1.0, judged[((3 * place) + 1)], place, 1, (links + (found + made)), params)
+        made += 1
+    if (rolling and (not still) and (not taken) and motion_constraints_observe_constraint(state, 0, params, &seen)):
+        model_with_rate_noise(state, &seen)
+        smoothing__take(state, &seen, 1.0, judged[((3 * place) + 2)], place, 2, (links + (found + made)), params)
+        made += 1
+    return made
+
+cdef bint smoothing__take(State* state, Observation* seen, double weight, int64_t verdict, int64_t place, int64_t part, Link* link, Parameters* params) noexcept nogil:
+    cdef double* p
+    cdef int64_t m
+    cdef double whitened[3]
+    cdef double distance
+    cdef int64_t a
+    cdef int _i
+    cdef double error[n]
+    p = state.covariance
+    m = seen.m
+    smoothing__begin_link(state, link, place, part)
+    measurement_update_project(state, seen, link.across, link.spread)
+    distance = 0.0
+    if (not measurement_update_whiten(link.spread, seen.innovation, seen.variance, m, whitened)):
+        return False
+    for a in range(m):
+        distance += (whitened[a] * whitened[a])
+        link.innovation[a], link.variance[a] = seen.innovation[a], seen.variance[a]
+        for _i in range(n):
+            (link.sight + (a) * n)[_i] = (seen.jacobian + (a) * n)[_i]
+    link.m, link.weight = m, weight
+    if ((verdict == 2) or ((verdict == 0) and (not (distance <= params.gates[m])))):
+        return False
+    if (not measurement_update_make_gain(p, seen, weight, False, link.across, link.spread, link.gain)):
+        return False
+    link.fused = True
+    measurement_update_joseph(p, seen, weight, link.across, link.gain)
+    memset(error, 0, n * sizeof(double))
+    for a in range(m):
+        axpy(error, seen.innovation[a], link.gain + (a) * n)
+    measurement_update_turn_along(p, error)
+    measurement_update_turn_rows(state.transition, error)
+    measurement_update_inject(state, error)
+    return True
+
+cdef void smoothing_go_back(State* state, Link* links, int64_t count, Row* rows, int64_t* judged, double* vector, double* matrix, double* looks, int64_t look, Parameters* params) noexcept nogil:
+    cdef int64_t i
+    cdef Link* link
+    for i in range((count - 1), (-1), (-1)):
+        link = (links + i)
+        if (link.m > 0):
+            smoothing__judge(link, (rows + link.row), judged, vector, matrix, params)
+            if link.fused:
+                smoothing_through_update(link, vector, matrix)
+        elif (link.part == -1):
+            look -= 1
+            smoothing__smooth_look(state, vector, matrix, looks, look)
+        smoothing_through_transition(link.transition, vector, matrix)
+
+cdef void smoothing__judge(Link* link, Row* row, int64_t* judged, double* vector, double* matrix, Parameters* params) noexcept nogil:
+    cdef int64_t m
+    cdef double innovation[3]
+    cdef double variance[3 * 3]
+    cdef double lower[3 * 3]
+    cdef double none[3]
+    cdef double whitened[3]
+    cdef double distance
+    cdef int64_t a
+    cdef int64_t verdict
+    m = link.m
+    memset(innovation, 0, 3 * sizeof(double))
+    memset(variance, 0, 3 * 3 * sizeof(double))
+    if (not smoothing_against_others(link, vector, matrix, innovation, variance)):
+        return
+    memset(none, 0, 3 * sizeof(double))
+    if ((not measurement_update_cholesky(variance, none, 1.0, m, lower)) or (not measurement_update_whiten(variance, innovation, none, m, whitened))):
+        return
+    distance = 0.0
+    for a in range(m):
+        distance += (whitened[a] * whitened[a])
+    verdict = (1 if (distance <= params.gates[m]) else 2)
+    judged[((3 * link.row) + link.part)] = verdict
+    if (params.models[(<int64_t>row.source)] == -1):
+        return
+    if (link.part == 0):
+        row.ratio = (distance / params.gates[m])
+        for a in range(m):
+            row.innovation[a], row.variance[a] = innovation[a], variance[(a) * 3 + a]
+    elif (link.part == 1):
+        row.innovation[2], row.variance[2] = innovation[0], variance[(0) * 3 + 0]
+
+cdef bint smoothing_against_others(Link* link, double* vector, double* matrix, double* innovation, double* variance) noexcept nogil:
+    cdef double along[3]
+    cdef double back[3 * 3]
+    cdef int64_t a
+    cdef int64_t b
+    if link.fused:
+        return smoothing__against_others_fused(link, vector, matrix, innovation, variance)
+    memset(along, 0, 3 * sizeof(double))
+    memset(back, 0, 3 * 3 * sizeof(double))
+    smoothing__seen_by(link.across, link.m, vector, matrix, along, back)
+    for a in range(link.m):
+        innovation[a] = (link.innovation[a] - along[a])
+        for b in range(link.m):
+            variance[(a) * 3 + b] = (link.spread[(a) * 3 + b] - back[(a) * 3 + b])
+        variance[(a) * 3 + a] += link.variance[a]
+    return True
+
+cdef bint smoothing__against_others_fused(Link* link, double* vector, double* matrix, double* innovation, double* variance) noexcept nogil:
+    cdef int64_t m
+    cdef double along[3]
+    cdef double back[3 * 3]
+    cdef double whole[3 * 3]
+    cdef double known[3 * 3]
+    cdef double none[3]
+    cdef int64_t a
+    cdef int64_t b
+    cdef double u
+    cdef int64_t c
+    m = link.m
+    memset(along, 0, 3 * sizeof(double))
+    memset(back, 0, 3 * 3 * sizeof(double))
+    memset(whole, 0, 3 * 3 * sizeof(double))
+    memset(known, 0, 3 * 3 * sizeof(double))
+    memset(none, 0, 3 * sizeof(double))
+    smoothing__seen_by(link.gain, m, vector, matrix, along, back)
+    if (not smoothing_inverse(link.spread, link.variance, link.weight, m, whole)):
+        return False
+    for a in range(m):
+        for b in range(m):
+            known[(a) * 3 + b] = (whole[(a) * 3 + b] + back[(a) * 3 + b])
+    if (not smoothing_inverse(known, none, 1.0, m, variance)):
+        return False
+    for a in range(m):
+        innovation[a] = 0.0
+        for b in range(m):
+            u = (-along[b])
+            for c in range(m):
+                u += (whole[(b) * 3 + c] * link.innovation[c])
+            innovation[a] += (variance[(a) * 3 + b] * u)
+    for a in range(m):
+        variance[(a) * 3 + a] -= ((link.weight - 1) * link.variance[a])
+    return True
+
+cdef void smoothing__seen_by(double* by, int64_t m, double* vector, double* matrix, double* along, double* back) noexcept nogil:
+    cdef double product[n]
+    cdef int64_t a
+    cdef int _i
+    cdef int64_t k
+    cdef int64_t b
+    for a in range(m):
+        along[a] = linear_dot(by + (a) * n, vector)
+        for _i in range(n):
+            product[_i] = 0.0
+        for k in range(n):
+            if (by[(a) * n + k] != 0.0):
+                axpy(product, by[(a) * n + k], matrix + (k) * n)
+        for b in range(m):
+            back[(a) * 3 + b] = linear_dot(product, by + (b) * n)
+
+cdef bint smoothing_inverse(double* spread, double* variance, double factor, int64_t m, double* found) noexcept nogil:
+    cdef double lower[3 * 3]
+    cdef double column[3]
+    cdef int64_t b
+    cdef int64_t i
+    cdef int64_t k
+    if (not measurement_update_cholesky(spread, variance, factor, m, lower)):
+        return False
+    for b in range(m):
+        for i in range(m):
+            column[i] = (1.0 if (i == b) else 0.0)
+            for k in range(i):
+                column[i] -= (lower[(i) * 3 + k] * column[k])
+            column[i] /= lower[(i) * 3 + i]
+        for i in range((m - 1), (-1), (-1)):
+            for k in range((i + 1), m):
+                column[i] -= (lower[(k) * 3 + i] * column[k])
+            column[i] /= lower[(i) * 3 + i]
+        for i in range(m):
+            found[(i) * 3 + b] = column[i]
+    return True
+
+cdef void smoothing_through_update(Link* link, double* vector, double* matrix) noexcept nogil:
+    cdef int64_t m
+    cdef double whole[3 * 3]
+    cdef double both[3 * 3]
+    cdef double by_gain[3 * n]
+    cdef int64_t a
+    cdef int _i
+    cdef int64_t k
+    cdef int64_t b
+    cdef double u[3]
+    m = link.m
+    memset(whole, 0, 3 * 3 * sizeof(double))
+    memset(both, 0, 3 * 3 * sizeof(double))
+    if (not smoothing_inverse(link.spread, link.variance, link.weight, m, whole)):
+        return
+    for a in range(m):
+        for _i in range(n):
+            (by_gain + (a) * n)[_i] = 0.0
+        for k in range(n):
+            if (link.gain[(a) * n + k] != 0.0):
+                axpy(by_gain + (a) * n, link.gain[(a) * n + k], matrix + (k) * n)
+    for a in range(m):
+        for b in range(m):
+            both[(a) * 3 + b] = (whole[(a) * 3 + b] + linear_dot(by_gain + (a) * n, link.gain + (b) * n))
+    memset(u, 0, 3 * sizeof(double))
+    for a in range(m):
+        u[a] = (-linear_dot(link.gain + (a) * n, vector))
+        for b in range(m):
+            u[a] += (whole[(a) * 3 + b] * link.innovation[b])
+    for a in range(m):
+        axpy(vector, u[a], link.sight + (a) * n)
+        for k in range(n):
+            axpy(matrix + (k) * n, (-by_gain[(a) * n + k]), link.sight + (a) * n)
+            if (link.sight[(a) * n + k] != 0.0):
+                axpy(matrix + (k) * n, (-link.sight[(a) * n + k]), by_gain + (a) * n)
+                for b in range(m):
+                    axpy(matrix + (k) * n, (link.sight[(a) * n + k] * both[(a) * 3 + b]), link.sight + (b) * n)
+    linear_mirror(matrix)
+
+cdef void smoothing_through_transition(double* transition, double* vector, double* matrix) noexcept nogil:
+    cdef double before[n]
+    cdef double moved[n]
+    cdef int64_t k
+    cdef bint same
+    cdef int64_t i
+    cdef double product[n * n]
+    cdef int _i
+    cdef double by
+    memset(moved, 0, n * sizeof(double))
+    for k in range(n):
+        before[k] = vector[k]
+        same = (transition[(k) * n + k] == 1.0)
+        for i in range(n):
+            if ((i != k) and (transition[(k) * n + i] != 0.0)):
+                same = False
+        moved[k] = (0.0 if same else 1.0)
+    for k in range(n):
+        if (moved[k] != 0.0):
+            axpy(vector, before[k], transition + (k) * n)
+            vector[k] -= before[k]
+    for i in range(n):
+        for _i in range(n):
+            (product + (i) * n)[_i] = (matrix + (i) * n)[_i]
+        for k in range(n):
+            if (moved[k] != 0.0):
+                axpy(product + (i) * n, matrix[(i) * n + k], transition + (k) * n)
+                product[(i) * n + k] -= matrix[(i) * n + k]
+    for i in range(n):
+        for _i in range(n):
+            (matrix + (i) * n)[_i] = (product + (i) * n)[_i]
+    for k in range(n):
+        if (moved[k] != 0.0):
+            for i in range(n):
+                by = (transition[(k) * n + i] - (1.0 if (i == k) else 0.0))
+                if (by != 0.0):
+                    axpy(matrix + (i) * n, by, product + (k) * n)
+    linear_mirror(matrix)
+
+cdef void smoothing__smooth_look(State* state, double* vector, double* matrix, double* looks, int64_t look) noexcept nogil:
+    cdef int64_t size
+    cdef int64_t at
+    cdef int64_t covariance
+    cdef int64_t k
+    cdef int64_t i
+    size = n
+    at = (look * ((35 + (size * size)) + 8))
+    covariance = (at + 35)
+    for k in range(35):
+        state.nominal[k] = looks[(at + k)]
+    for i in range(n):
+        for k in range(n):
+            state.covariance[(i) * n + k] = looks[((covariance + (i * size)) + k)]
+    smoothing_smooth(state, vector, matrix)
+    for k in range(35):
+        looks[(at + k)] = state.nominal[k]
+    for i in range(n):
+        for k in range(n):
+            looks[((covariance + (i * size)) + k)] = state.covariance[(i) * n + k]
+
+cdef void smoothing_smooth(State* state, double* vector, double* matrix) noexcept nogil:
+    cdef double* p
+    cdef double error[n]
+    cdef double known[n * n]
+    cdef double gone[n * n]
+    cdef int64_t i
+    cdef int _i
+    cdef int64_t k
+    p = state.covariance
+    for i in range(n):
+        error[i] = linear_dot(p + (i) * n, vector)
+        for _i in range(n):
+            (known + (i) * n)[_i] = 0.0
+        for k in range(n):
+            if (p[(i) * n + k] != 0.0):
+                axpy(known + (i) * n, p[(i) * n + k], matrix + (k) * n)
+    for i in range(n):
+        for _i in range(n):
+            (gone + (i) * n)[_i] = 0.0
+        for k in range(n):
+            if (known[(i) * n + k] != 0.0):
+                axpy(gone + (i) * n, known[(i) * n + k], p + (k) * n)
+    for i in range(n):
+        axpy(p + (i) * n, (-1.0), gone + (i) * n)
+    linear_mirror(p)
+    measurement_update_turn_along(p, error)
+    measurement_update_inject(state, error)
+
 # ---------------- fusiond.filter.source_health
 
 cdef void source_health_begin(double* memory) noexcept nogil:
@@ -3929,6 +4401,8 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     for _i in range(4):
         (x + 6)[_i] = _t12[_i]
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
+    if state.tracked:
+        strapdown__follow(state.transition, dt, force_e, mat_eb, gradient)
     doubt = x[34]
     strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 0.01)), (noise.gyro + (doubt * 0.0001)), noise)
     if (doubt > 0):
@@ -3955,9 +4429,118 @@ cdef void strapdown__grow(double* p, double dt, double* force_e, double* mat_eb,
     cdef double* f
     cdef double half_dt2
     cdef double earth_turn
+    cdef double rows[9 * n]
+    cdef double turned[3 * 9]
+    cdef double felt[3 * 9]
+    cdef double corner[9 * 9]
+    cdef int64_t i
+    cdef double _t1
+    cdef double _t2
+    cdef double _t3
+    cdef int _i
+    cdef double _t4
+    cdef double _t5
+    cdef double _t6
+    cdef double _t7
+    cdef double _t8
+    cdef double _t9
+    cdef double _t10
+    cdef double _t11
+    cdef double _t12
+    cdef double* pulled
+    cdef double _t13
+    cdef double _t14
+    cdef double _t15
+    cdef double _t16
+    cdef double _t17
+    cdef double _t18
+    cdef double _t19
+    cdef double _t20
+    cdef double _t21
+    cdef double _t22
+    cdef double _t23
+    c = mat_eb
+    f = force_e
+    half_dt2, earth_turn = ((dt * dt) / 2), (7.292115e-05 * dt)
+    strapdown__move_rows(p, dt, f, c, gradient, rows)
+    for i in range(3):
+        _t1 = c[(i) * 3 + 0]
+        _t2 = c[(i) * 3 + 1]
+        _t3 = c[(i) * 3 + 2]
+        for _i in range(9):
+            (turned + (i) * 9)[_i] = (((_t1 * (rows + 9)[_i * n]) + (_t2 * (rows + 10)[_i * n])) + (_t3 * (rows + 11)[_i * n]))
+        _t4 = c[(i) * 3 + 0]
+        _t5 = c[(i) * 3 + 1]
+        _t6 = c[(i) * 3 + 2]
+        for _i in range(9):
+            (felt + (i) * 9)[_i] = (((_t4 * (rows + 12)[_i * n]) + (_t5 * (rows + 13)[_i * n])) + (_t6 * (rows + 14)[_i * n]))
+    _t7 = f[1]
+    _t8 = f[2]
+    for _i in range(9):
+        (felt + (0) * 9)[_i] += ((_t7 * (rows + 8)[_i * n]) - (_t8 * (rows + 7)[_i * n]))
+    _t9 = f[2]
+    _t10 = f[0]
+    for _i in range(9):
+        (felt + (1) * 9)[_i] += ((_t9 * (rows + 6)[_i * n]) - (_t10 * (rows + 8)[_i * n]))
+    _t11 = f[0]
+    _t12 = f[1]
+    for _i in range(9):
+        (felt + (2) * 9)[_i] += ((_t11 * (rows + 7)[_i * n]) - (_t12 * (rows + 6)[_i * n]))
+    for i in range(3):
+        pulled = gradient + (i) * 3
+        for _i in range(9):
+            (corner + (i) * 9)[_i] = (((rows + i)[_i * n] + (dt * (rows + (3 + i))[_i * n])) - (half_dt2 * (felt + (i) * 9)[_i]))
+        _t13 = pulled[0]
+        _t14 = pulled[1]
+        _t15 = pulled[2]
+        for _i in range(9):
+            (corner + ((3 + i)) * 9)[_i] = (((rows + (3 + i))[_i * n] - (dt * (felt + (i) * 9)[_i])) + (dt * (((_t13 * (rows + 0)[_i * n]) + (_t14 * (rows + 1)[_i * n])) + (_t15 * (rows + 2)[_i * n]))))
+        for _i in range(9):
+            (corner + ((6 + i)) * 9)[_i] = ((rows + (6 + i))[_i * n] - (dt * (turned + (i) * 9)[_i]))
+    _t16 = f[1]
+    _t17 = f[2]
+    _t18 = (2 * earth_turn)
+    for _i in range(9):
+        (corner + (3) * 9)[_i] += ((half_dt2 * ((_t16 * (turned + (2) * 9)[_i]) - (_t17 * (turned + (1) * 9)[_i]))) + (_t18 * (rows + 4)[_i * n]))
+    _t19 = f[2]
+    _t20 = f[0]
+    _t21 = (2 * earth_turn)
+    for _i in range(9):
+        (corner + (4) * 9)[_i] += ((half_dt2 * ((_t19 * (turned + (0) * 9)[_i]) - (_t20 * (turned + (2) * 9)[_i]))) - (_t21 * (rows + 3)[_i * n]))
+    _t22 = f[0]
+    _t23 = f[1]
+    for _i in range(9):
+        (corner + (5) * 9)[_i] += (half_dt2 * ((_t22 * (turned + (1) * 9)[_i]) - (_t23 * (turned + (0) * 9)[_i])))
+    for _i in range(9):
+        (corner + (6) * 9)[_i] += (earth_turn * (rows + 7)[_i * n])
+    for _i in range(9):
+        (corner + (7) * 9)[_i] -= (earth_turn * (rows + 6)[_i * n])
+    for i in range(9):
+        for _i in range((9 - i)):
+            (p + (i) * n + i)[_i] = (corner + i + (i) * 9)[_i * 9]
+        for _i in range((9 - i)):
+            (p + i + (i) * n)[_i * n] = (corner + i + (i) * 9)[_i * 9]
+        for _i in range((n - 9)):
+            (p + (i) * n + 9)[_i] = (rows + (i) * n + 9)[_i]
+        for _i in range((n - 9)):
+            (p + i + (9) * n)[_i * n] = (rows + (i) * n + 9)[_i]
+
+cdef void strapdown__follow(double* a, double dt, double* force_e, double* mat_eb, double* gradient) noexcept nogil:
+    cdef double rows[9 * n]
+    cdef int64_t i
+    cdef int _i
+    strapdown__move_rows(a, dt, force_e, mat_eb, gradient, rows)
+    for i in range(9):
+        for _i in range(n):
+            (a + (i) * n)[_i] = (rows + (i) * n)[_i]
+
+cdef void strapdown__move_rows(double* p, double dt, double* force_e, double* mat_eb, double* gradient, double* rows) noexcept nogil:
+    cdef double* c
+    cdef double* f
+    cdef double half_dt2
+    cdef double earth_turn
     cdef double by_gyro[3 * n]
     cdef double by_force[3 * n]
-    cdef double rows[9 * n]
     cdef int64_t i
     cdef double _t1
     cdef double _t2
@@ -3986,32 +4569,6 @@ cdef void strapdown__grow(double* p, double dt, double* force_e, double* mat_eb,
     cdef double _t23
     cdef double _t24
     cdef double _t25
-    cdef double turned[3 * 9]
-    cdef double felt[3 * 9]
-    cdef double corner[9 * 9]
-    cdef double _t26
-    cdef double _t27
-    cdef double _t28
-    cdef double _t29
-    cdef double _t30
-    cdef double _t31
-    cdef double _t32
-    cdef double _t33
-    cdef double _t34
-    cdef double _t35
-    cdef double _t36
-    cdef double _t37
-    cdef double _t38
-    cdef double _t39
-    cdef double _t40
-    cdef double _t41
-    cdef double _t42
-    cdef double _t43
-    cdef double _t44
-    cdef double _t45
-    cdef double _t46
-    cdef double _t47
-    cdef double _t48
     c = mat_eb
     f = force_e
     half_dt2, earth_turn = ((dt * dt) / 2), (7.292115e-05 * dt)
@@ -4068,67 +4625,6 @@ cdef void strapdown__grow(double* p, double dt, double* force_e, double* mat_eb,
     axpy(rows + (6) * n, earth_turn, p + (7) * n)
     for _i in range(n):
         (rows + (7) * n)[_i] -= (earth_turn * (p + (6) * n)[_i])
-    for i in range(3):
-        _t26 = c[(i) * 3 + 0]
-        _t27 = c[(i) * 3 + 1]
-        _t28 = c[(i) * 3 + 2]
-        for _i in range(9):
-            (turned + (i) * 9)[_i] = (((_t26 * (rows + 9)[_i * n]) + (_t27 * (rows + 10)[_i * n])) + (_t28 * (rows + 11)[_i * n]))
-        _t29 = c[(i) * 3 + 0]
-        _t30 = c[(i) * 3 + 1]
-        _t31 = c[(i) * 3 + 2]
-        for _i in range(9):
-            (felt + (i) * 9)[_i] = (((_t29 * (rows + 12)[_i * n]) + (_t30 * (rows + 13)[_i * n])) + (_t31 * (rows + 14)[_i * n]))
-    _t32 = f[1]
-    _t33 = f[2]
-    for _i in range(9):
-        (felt + (0) * 9)[_i] += ((_t32 * (rows + 8)[_i * n]) - (_t33 * (rows + 7)[_i * n]))
-    _t34 = f[2]
-    _t35 = f[0]
-    for _i in range(9):
-        (felt + (1) * 9)[_i] += ((_t34 * (rows + 6)[_i * n]) - (_t35 * (rows + 8)[_i * n]))
-    _t36 = f[0]
-    _t37 = f[1]
-    for _i in range(9):
-        (felt + (2) * 9)[_i] += ((_t36 * (rows + 7)[_i * n]) - (_t37 * (rows + 6)[_i * n]))
-    for i in range(3):
-        pulled = gradient + (i) * 3
-        for _i in range(9):
-            (corner + (i) * 9)[_i] = (((rows + i)[_i * n] + (dt * (rows + (3 + i))[_i * n])) - (half_dt2 * (felt + (i) * 9)[_i]))
-        _t38 = pulled[0]
-        _t39 = pulled[1]
-        _t40 = pulled[2]
-        for _i in range(9):
-            (corner + ((3 + i)) * 9)[_i] = (((rows + (3 + i))[_i * n] - (dt * (felt + (i) * 9)[_i])) + (dt * (((_t38 * (rows + 0)[_i * n]) + (_t39 * (rows + 1)[_i * n])) + (_t40 * (rows + 2)[_i * n]))))
-        for _i in range(9):
-            (corner + ((6 + i)) * 9)[_i] = ((rows + (6 + i))[_i * n] - (dt * (turned + (i) * 9)[_i]))
-    _t41 = f[1]
-    _t42 = f[2]
-    _t43 = (2 * earth_turn)
-    for _i in range(9):
-        (corner + (3) * 9)[_i] += ((half_dt2 * ((_t41 * (turned + (2) * 9)[_i]) - (_t42 * (turned + (1) * 9)[_i]))) + (_t43 * (rows + 4)[_i * n]))
-    _t44 = f[2]
-    _t45 = f[0]
-    _t46 = (2 * earth_turn)
-    for _i in range(9):
-        (corner + (4) * 9)[_i] += ((half_dt2 * ((_t44 * (turned + (0) * 9)[_i]) - (_t45 * (turned + (2) * 9)[_i]))) - (_t46 * (rows + 3)[_i * n]))
-    _t47 = f[0]
-    _t48 = f[1]
-    for _i in range(9):
-        (corner + (5) * 9)[_i] += (half_dt2 * ((_t47 * (turned + (1) * 9)[_i]) - (_t48 * (turned + (0) * 9)[_i])))
-    for _i in range(9):
-        (corner + (6) * 9)[_i] += (earth_turn * (rows + 7)[_i * n])
-    for _i in range(9):
-        (corner + (7) * 9)[_i] -= (earth_turn * (rows + 6)[_i * n])
-    for i in range(9):
-        for _i in range((9 - i)):
-            (p + (i) * n + i)[_i] = (corner + i + (i) * 9)[_i * 9]
-        for _i in range((9 - i)):
-            (p + i + (i) * n)[_i * n] = (corner + i + (i) * 9)[_i * 9]
-        for _i in range((n - 9)):
-            (p + (i) * n + 9)[_i] = (rows + (i) * n + 9)[_i]
-        for _i in range((n - 9)):
-            (p + i + (9) * n)[_i * n] = (rows + (i) * n + 9)[_i]
 
 cdef void strapdown__add_noise(double* p, double dt, double accel, double gyro, Noise* noise) noexcept nogil:
     cdef int64_t i
@@ -4188,6 +4684,9 @@ cdef void strapdown__coast(State* state, double dt, Noise* noise, bint rests) no
         for _i in range(n):
             (p + i)[_i * n] += (dt * (p + (3 + i))[_i * n])
     linear_mirror(p)
+    if state.tracked:
+        for i in range(3):
+            axpy(state.transition + (i) * n, dt, state.transition + ((3 + i)) * n)
     strapdown__add_noise(p, dt, (0.0 if rests else portable_square(2.0)), portable_square(0.03), noise)
     if rests:
         return
@@ -4266,6 +4765,10 @@ cdef void strapdown_end_coasting(State* state) noexcept nogil:
     for i in range(3):
         for j in range(3):
             p[((bias + i)) * n + (bias + j)] = a[((77 + (3 * i)) + j)]
+    if state.tracked:
+        for i in range(3):
+            for _i in range(n):
+                (state.transition + ((bias + i)) * n)[_i] = 0.0
 
 cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double* x
@@ -4286,11 +4789,12 @@ cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double _t5[4]
     cdef double sideways_e[3]
     cdef double rows[6 * n]
+    cdef int64_t i
+    cdef double columns[6 * n]
     cdef double _t6
     cdef double _t7
     cdef double _t8
     cdef double by_rate[n]
-    cdef int64_t i
     cdef double along
     cdef double across
     cdef double _t9
@@ -4299,16 +4803,6 @@ cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     cdef double _t12
     cdef double _t13
     cdef double _t14
-    cdef double columns[6 * n]
-    cdef double _t15
-    cdef double _t16
-    cdef double _t17
-    cdef double _t18
-    cdef double _t19
-    cdef double _t20
-    cdef double _t21
-    cdef double _t22
-    cdef double _t23
     cdef double kept
     cdef double fresh
     cdef int64_t j
@@ -4334,43 +4828,32 @@ cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     for _i in range(4):
         (x + 6)[_i] = _t4[_i]
     rotation_cross(up_e, x + 3, sideways_e)
+    strapdown__turn_rows(p, dt, mat, up_e, up_b, sideways_e, rows)
+    for i in range(6):
+        for _i in range(n):
+            (p + ((3 + i)) * n)[_i] = (rows + (i) * n)[_i]
+    if state.tracked:
+        strapdown__turn_rows(state.transition, dt, mat, up_e, up_b, sideways_e, rows)
+        for i in range(6):
+            for _i in range(n):
+                (state.transition + ((3 + i)) * n)[_i] = (rows + (i) * n)[_i]
     _t6 = up_b[0]
     _t7 = up_b[1]
     _t8 = up_b[2]
     for _i in range(n):
-        by_rate[_i] = (((_t6 * (p + (bias) * n)[_i]) + (_t7 * (p + ((bias + 1)) * n)[_i])) + (_t8 * (p + ((bias + 2)) * n)[_i]))
+        by_rate[_i] = (((_t6 * (p + bias)[_i * n]) + (_t7 * (p + (bias + 1))[_i * n])) + (_t8 * (p + (bias + 2))[_i * n]))
     for i in range(3):
         along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
         _t9 = mat[(i) * 3 + 0]
         _t10 = mat[(i) * 3 + 1]
         _t11 = mat[(i) * 3 + 2]
         for _i in range(n):
-            (rows + (i) * n)[_i] = ((((_t9 * (p + (3) * n)[_i]) + (_t10 * (p + (4) * n)[_i])) + (_t11 * (p + (5) * n)[_i])) + (along * by_rate[_i]))
+            (columns + (i) * n)[_i] = ((((_t9 * (p + 3)[_i * n]) + (_t10 * (p + 4)[_i * n])) + (_t11 * (p + 5)[_i * n])) + (along * by_rate[_i]))
         _t12 = mat[(i) * 3 + 0]
         _t13 = mat[(i) * 3 + 1]
         _t14 = mat[(i) * 3 + 2]
         for _i in range(n):
-            (rows + ((3 + i)) * n)[_i] = ((((_t12 * (p + (6) * n)[_i]) + (_t13 * (p + (7) * n)[_i])) + (_t14 * (p + (8) * n)[_i])) + (across * by_rate[_i]))
-    for i in range(6):
-        for _i in range(n):
-            (p + ((3 + i)) * n)[_i] = (rows + (i) * n)[_i]
-    _t15 = up_b[0]
-    _t16 = up_b[1]
-    _t17 = up_b[2]
-    for _i in range(n):
-        by_rate[_i] = (((_t15 * (p + bias)[_i * n]) + (_t16 * (p + (bias + 1))[_i * n])) + (_t17 * (p + (bias + 2))[_i * n]))
-    for i in range(3):
-        along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
-        _t18 = mat[(i) * 3 + 0]
-        _t19 = mat[(i) * 3 + 1]
-        _t20 = mat[(i) * 3 + 2]
-        for _i in range(n):
-            (columns + (i) * n)[_i] = ((((_t18 * (p + 3)[_i * n]) + (_t19 * (p + 4)[_i * n])) + (_t20 * (p + 5)[_i * n])) + (along * by_rate[_i]))
-        _t21 = mat[(i) * 3 + 0]
-        _t22 = mat[(i) * 3 + 1]
-        _t23 = mat[(i) * 3 + 2]
-        for _i in range(n):
-            (columns + ((3 + i)) * n)[_i] = ((((_t21 * (p + 6)[_i * n]) + (_t22 * (p + 7)[_i * n])) + (_t23 * (p + 8)[_i * n])) + (across * by_rate[_i]))
+            (columns + ((3 + i)) * n)[_i] = ((((_t12 * (p + 6)[_i * n]) + (_t13 * (p + 7)[_i * n])) + (_t14 * (p + 8)[_i * n])) + (across * by_rate[_i]))
     for i in range(6):
         for _i in range(n):
             (p + (3 + i))[_i * n] = (columns + (i) * n)[_i]
@@ -4381,8 +4864,47 @@ cdef void strapdown__turn(State* state, double dt, double* up_e) noexcept nogil:
     for i in range(3):
         for _i in range(n):
             (p + (bias + i))[_i * n] *= kept
+    if state.tracked:
+        for i in range(3):
+            for _i in range(n):
+                (state.transition + ((bias + i)) * n)[_i] *= kept
     fresh = (portable_square(0.25) * (1 - (kept * kept)))
     for i in range(3):
         a[(9 + i)] = (x[(10 + i)] + ((speed * kept) * up_b[i]))
         for j in range(3):
             p[((bias + i)) * n + (bias + j)] += ((fresh * up_b[i]) * up_b[j])
+
+cdef void strapdown__turn_rows(double* p, double dt, double* mat, double* up_e, double* up_b, double* sideways_e, double* rows) noexcept nogil:
+    cdef int64_t bias
+    cdef double _t1
+    cdef double _t2
+    cdef double _t3
+    cdef double by_rate[n]
+    cdef int _i
+    cdef int64_t i
+    cdef double along
+    cdef double across
+    cdef double _t4
+    cdef double _t5
+    cdef double _t6
+    cdef double _t7
+    cdef double _t8
+    cdef double _t9
+    bias = 9
+    _t1 = up_b[0]
+    _t2 = up_b[1]
+    _t3 = up_b[2]
+    for _i in range(n):
+        by_rate[_i] = (((_t1 * (p + (bias) * n)[_i]) + (_t2 * (p + ((bias + 1)) * n)[_i])) + (_t3 * (p + ((bias + 2)) * n)[_i]))
+    for i in range(3):
+        along, across = ((-dt) * sideways_e[i]), ((-dt) * up_e[i])
+        _t4 = mat[(i) * 3 + 0]
+        _t5 = mat[(i) * 3 + 1]
+        _t6 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (rows + (i) * n)[_i] = ((((_t4 * (p + (3) * n)[_i]) + (_t5 * (p + (4) * n)[_i])) + (_t6 * (p + (5) * n)[_i])) + (along * by_rate[_i]))
+        _t7 = mat[(i) * 3 + 0]
+        _t8 = mat[(i) * 3 + 1]
+        _t9 = mat[(i) * 3 + 2]
+        for _i in range(n):
+            (rows + ((3 + i)) * n)[_i] = ((((_t7 * (p + (6) * n)[_i]) + (_t8 * (p + (7) * n)[_i])) + (_t9 * (p + (8) * n)[_i])) + (across * by_rate[_i]))

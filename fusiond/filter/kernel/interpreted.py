@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from fusiond.filter.north_east_down import to_north_east_down
 from fusiond.filter.parameters import Parameters
 from fusiond.filter.rows import ROW, Outcome, Rows
+from fusiond.filter.smoothing import LINKS, Link, follow, go_back
 from fusiond.filter.state import WIDE_SIZE, FilterState, T
 from fusiond.filter.step import can_step, first_changed, is_final, place, predict, run_one
 from fusiond.filter.strapdown import propagate
-from fusiond.maths.typed import Array
+from fusiond.maths.typed import Array, Stamps
 
 Memory = tuple[Array, NDArray[np.int64], NDArray[np.int64]]  # snapshots: numbers, stamps, rows applied; one a row
 
@@ -51,6 +52,25 @@ class Kernel:
     def predict(self, state: FilterState, t_ns: int) -> None:
         """Carry a state to an instant for publication (fusiond.filter.step.predict)."""
         predict(state, t_ns, self.params)
+
+    def follow(self, state: FilterState, rows: Rows, judged: Stamps, looks: Array) -> int:
+        """Take a stretch of rows into a tracked state, and keep its links (fusiond.filter.smoothing.follow)."""
+        self._links = [Link(state.size) for _ in range(LINKS * len(rows) + 1)]
+        return follow(state, rows, len(rows), judged, looks, self._links, self.params)
+
+    def go_back(
+        self,
+        state: FilterState,
+        count: int,
+        rows: Rows,
+        judged: Stamps,
+        vector: Array,
+        matrix: Array,
+        looks: Array,
+        look: int,
+    ) -> None:
+        """Carry the adjoint back over the links of the stretch that was followed last (fusiond.filter.smoothing.go_back)."""
+        go_back(state, self._links, count, rows, judged, vector, matrix, looks, look, self.params)
 
     def to_north_east_down(self, nominal: Array, covariance: Array) -> Array:
         """The state in north-east-down (fusiond.filter.north_east_down.to_north_east_down)."""

@@ -8,7 +8,7 @@ processor, and those of the interpreter.
 
 from libc.math cimport INFINITY, NAN, ceil, fabs, floor, isfinite, isnan, ldexp, sqrt
 from libc.stdint cimport int32_t, int64_t
-from libc.stdlib cimport labs
+from libc.stdlib cimport free, labs, malloc
 from libc.string cimport memcpy, memmove, memset
 
 import numpy as np
@@ -40,6 +40,8 @@ cdef class Kernel:
     cdef double[:, ::1] kept_numbers
     cdef int64_t[:, ::1] kept_whole
     cdef int64_t[::1] kept_applied
+    cdef Link* links  # of the stretch that was smoothed last
+    cdef int64_t links_room
     cdef int64_t numbers_size, core_size  # of a state, with and without the bank of hypotheses
 
     def __init__(self, params):
@@ -66,6 +68,9 @@ cdef class Kernel:
         self.core_size = NOMINAL_SIZE + n * n + AUXILIARY_SIZE + self.sources * MEMORY_SIZE
         self.numbers_size = self.core_size + HYPOTHESES * BLOCK
 
+    def __dealloc__(self):
+        free(self.links)
+
     cdef int bind(self, double[::1] numbers, int64_t[::1] whole) except -1:
         if numbers.shape[0] != self.numbers_size:
             raise ValueError(f"a state of {self.numbers_size} numbers is needed, not {numbers.shape[0]}")
@@ -79,6 +84,7 @@ cdef class Kernel:
         self.state.stamps = &whole[0]
         self.state.source_stamps = self.state.stamps + STAMPS_SIZE
         self.state.size, self.state.sources = n, self.sources
+        self.state.tracked = False
         return 0
 
     def propagate(self, state, double dt, double[::1] force_b, double[::1] rate_b):
@@ -90,6 +96,35 @@ cdef class Kernel:
         """fusiond.filter.step.predict"""
         self.bind(state.numbers, state.whole)
         step_predict(&self.state, t_ns, &self.params)
+
+    def follow(self, state, Row[::1] rows, int64_t[::1] judged, double[::1] looks):
+        """Kernel.follow of the interpreter"""
+        cdef int64_t count = rows.shape[0], found
+        cdef double[:, ::1] transition = state.transition
+        if judged.shape[0] < PARTS * count or transition.shape[0] != n or transition.shape[1] != n:
+            raise ValueError("not the arrays of a tracked state and its rows")
+        self.bind(state.numbers, state.whole)
+        self.state.tracked, self.state.transition = True, &transition[0, 0]
+        if self.links_room < LINKS * count + 1:
+            free(self.links)
+            self.links_room = LINKS * count + 1
+            self.links = <Link*> malloc(self.links_room * sizeof(Link))
+            if self.links is NULL:
+                self.links_room = 0
+                raise MemoryError("no memory for the links of a stretch")
+        with nogil:
+            found = smoothing_follow(&self.state, &rows[0], count, &judged[0], &looks[0], self.links, &self.params)
+        return found
+
+    def go_back(self, state, int64_t count, Row[::1] rows, int64_t[::1] judged, double[::1] vector,
+                double[:, ::1] matrix, double[::1] looks, int64_t look):
+        """Kernel.go_back of the interpreter"""
+        if vector.shape[0] != n or matrix.shape[0] != n or matrix.shape[1] != n or count > self.links_room:
+            raise ValueError(f"an adjoint of {n} error states is needed")
+        self.bind(state.numbers, state.whole)
+        with nogil:
+            smoothing_go_back(&self.state, self.links, count, &rows[0], &judged[0], &vector[0], &matrix[0, 0], &looks[0],
+                              look, &self.params)
 
     def to_north_east_down(self, double[::1] nominal, double[:, ::1] covariance):
         """fusiond.filter.north_east_down.to_north_east_down"""

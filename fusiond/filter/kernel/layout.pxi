@@ -17,6 +17,8 @@ cdef enum:
     PARAMETERS = 16
     IMU = -1
     STATE_N_SIZE = 91
+    PARTS = 3
+    LINKS = 4
     BLOCK = 1 + NOMINAL_SIZE + n * n  # numbers of a hypothesis: weight, nominal, covariance
 
 cdef struct Noise:
@@ -32,6 +34,20 @@ cdef struct Observation:
     double jacobian[2 * n + WIDE_SIZE]
     double variance[3]
     double common[3]
+
+cdef struct Link:
+    int64_t row
+    int64_t part
+    int64_t m
+    bint fused
+    double weight
+    double innovation[3]
+    double variance[3]
+    double spread[3 * 3]
+    double sight[3 * n]
+    double across[3 * n]
+    double gain[3 * n]
+    double transition[n * n]
 
 cdef struct Row:
     int64_t t_ns
@@ -54,6 +70,8 @@ cdef struct State:
     int64_t* source_stamps
     int64_t size
     int64_t sources
+    double* transition
+    bint tracked
 
 cdef struct Parameters:
     Noise noise

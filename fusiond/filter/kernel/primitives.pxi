@@ -27,6 +27,7 @@ cdef inline State hypothesis_of(State* state, int64_t number) noexcept nogil:
     cdef State view = state[0]
     view.nominal = state.bank + number * BLOCK + 1
     view.covariance = view.nominal + NOMINAL_SIZE
+    view.tracked = False
     return view
 
 
