@@ -13,6 +13,7 @@ from threading import current_thread, main_thread
 COMMANDS = {
     "run": "fuse the live inputs, and publish the state",
     "replay": "fuse recorded logs into a track",
+    "smooth": "smooth recorded logs: each state from all that was measured, before and after it",
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
     "check": "explain what a configuration does, or what is wrong with it",
     "mount": "estimate the mounting angles of the IMU from logs",

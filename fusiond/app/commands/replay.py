@@ -66,6 +66,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
         help="with --truth: replay again with GNSS withheld over many stretches of this length, such as 1000m or 60s, and"
         " tell the errors at their ends",
     )
+    add("--smooth", metavar="OUT.csv", type=Path, help="smooth the drive as well, and write that track (`fusiond smooth`)")
     add("--rate", metavar="HZ", type=rate, help="publications per second; default: publish.rate_hz of the config")
     add("--speed", metavar="X", type=positive, help="replay at X times real time; default: as fast as possible")
     add("--publish", action="store_true", help="publish over Zenoh, as configured, everything that `fusiond run` publishes")
@@ -96,6 +97,8 @@ def run(arguments: argparse.Namespace) -> None:
         window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
         outage_length=parse_length(arguments.outage_length) if arguments.outage_length else None,
         rate_hz=arguments.rate,
+        smooth=arguments.smooth is not None,
+        smooth_csv=arguments.smooth,
         speed=arguments.speed,
         publish=arguments.publish,
         outputs=arguments.outputs,

@@ -41,6 +41,7 @@ from fusiond.app.replay.outages import (
 )
 from fusiond.app.replay.pacer import Pacer
 from fusiond.app.replay.replay import WHOLE, Replay, ReplayTask
+from fusiond.app.replay.smoothed import Smoothing
 from fusiond.app.replay.summary import Summary, to_json
 from fusiond.app.replay.trace import Trace
 from fusiond.config.schema import Config
@@ -68,6 +69,8 @@ class Options:
     window: Window = WHOLE
     rate_hz: float | None = None  # default: the configuration's
     outage_length: Length | None = None  # replay again with GNSS outages of this length; needs a truth
+    smooth: bool = False  # smooth the drive as well
+    smooth_csv: Path | None = None  # file of the smoothed track
     speed: float | None = None  # default: as fast as possible
     publish: bool = False  # over Zenoh
     outputs: bool = False  # to every output that the configuration turns on
@@ -94,6 +97,7 @@ def replay(options: Options) -> Summary:
     attached_warnings: list[str] = []
     with ExitStack() as stack:
         _open_files(options, task, stack)
+        smoothing = _smoothing(options, task, stack) if options.smooth else None
         if options.publish or options.outputs:
             from fusiond.app.replay.attached import Attached  # noqa: PLC0415 - Zenoh is slow to import
 
@@ -105,9 +109,13 @@ def replay(options: Options) -> Summary:
             stack.enter_context(attached.opened(run.engine))
         else:
             run = Replay(config, task)
+        if smoothing:
+            smoothing.attach(run)
         share = options.share or (lambda _: logs.bytes_read / logs.bytes_total)
         run.run(shown(logs, lambda: share(run.elapsed_ns), lambda: run.elapsed_ns, sys.stderr) if options.bar else logs)
-    summary = _summary(options, run, logs, attached_warnings)
+        summary = _summary(options, run, logs, attached_warnings)
+        if smoothing:
+            summary = replace(summary, smoothed=smoothing.finish(task.truth, options.window))
     if options.outage_length:
         summary = _with_outages(options, options.outage_length, run, task, summary)
     if options.json:
@@ -149,11 +157,19 @@ def _replay_outages(options: Options, stretches: Sequence[Stretch], task: Replay
     return log.ends()
 
 
+def _smoothing(options: Options, task: ReplayTask, stack: ExitStack) -> Smoothing:
+    """What smooths the drive at the instants of its states, into the file that is asked for."""
+    smoothing = Smoothing([csv_file(options.smooth_csv, stack)] if options.smooth_csv else [], stack)
+    task.on_tick.append(smoothing.add_tick)
+    return smoothing
+
+
 def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
     """Open the files of the ticks. A file that cannot be written is detected before the work begins."""
     check_suffix("--plot", options.plot, ".png")
     check_suffix("--mcap", options.mcap, ".mcap")
-    outputs = [path for path in (options.csv, options.json, options.plot, options.mcap) if path]
+    files = (options.csv, options.json, options.plot, options.mcap, options.smooth_csv)
+    outputs = [path for path in files if path]
     inputs = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
     check_outputs(outputs, inputs)
     if options.plot and importlib.util.find_spec("matplotlib") is None:

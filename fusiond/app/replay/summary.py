@@ -103,6 +103,27 @@ class DeadReckoning(Struct, frozen=True, kw_only=True):
     stretches: list[Stretch]
 
 
+class JudgedSource(Struct, kw_only=True):
+    """How the measurements of a source were judged by all others, before and after each."""
+
+    used: int = 0
+    left_out: int = 0
+    dropped: int = 0  # of those left out: which the filter had fused, because it knew no better yet
+    taken_back: int = 0  # of those used: which the filter had rejected
+
+
+class SmoothedReport(Struct, frozen=True, kw_only=True):
+    """What the smoother gave."""
+
+    states: int  # smoothed
+    runs: int  # times from an alignment to the next
+    lost: int  # runs without a smoothed state: their numbers were no longer finite
+    sigma_m: float | None  # horizontal, root mean square; None without a state
+    filter_sigma_m: float | None  # the same of the filter's states at the same instants
+    sources: dict[str, JudgedSource]
+    truth: TruthReport | None = None  # how far the smoothed states lie from the truth
+
+
 class Summary(Struct, frozen=True, kw_only=True):
     """The report of a replay. The same inputs give the same bytes: it has no wall-clock time and no path."""
 
@@ -123,6 +144,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     dead_reckoning: DeadReckoning | None = None
     truth: TruthReport | None = None
     outages: OutageReport | None = None
+    smoothed: SmoothedReport | None = None
 
 
 def to_json(summary: Summary) -> bytes:
@@ -265,7 +287,10 @@ def _lines(summary: Summary) -> Iterator[str]:
         yield from _dead_reckoning(summary.dead_reckoning)
     if summary.truth:
         yield ""
-        yield from _truth(summary.truth)
+        yield from truth_lines(summary.truth)
+    if summary.smoothed:
+        yield ""
+        yield from smoothed_lines(summary.smoothed)
     if summary.outages:
         yield ""
         yield from _outages(summary.outages)
@@ -363,11 +388,31 @@ def _dead_reckoning(found: DeadReckoning) -> Iterator[str]:
         yield f"               and {found.count - 5} more times; {found.seconds:.0f} s in all"
 
 
-def _truth(truth: TruthReport) -> Iterator[str]:
+def smoothed_lines(report: SmoothedReport) -> Iterator[str]:
+    """What the smoother gave, for a reader at a terminal."""
+    if not report.states:
+        yield "smoothed       nothing: there was no state"
+        return
+    runs = f" in {report.runs} runs" if report.runs > 1 else ""
+    lost = f"; {report.lost} of the runs could not be smoothed: numbers were no longer finite" if report.lost else ""
+    yield f"smoothed       {report.states} states{runs}{lost}"
+    if report.sigma_m is not None and report.filter_sigma_m is not None:
+        yield f"  horizontal sigma {report.sigma_m:.2f} m, the filter's {report.filter_sigma_m:.2f} m (root mean square)"
+    for name, source in report.sources.items():
+        if source.dropped or source.taken_back:
+            yield (
+                f"  {name}: judged by what came before and after, {source.dropped} that the filter had fused are left out,"
+                f" and {source.taken_back} that it had rejected are used; {source.used} are used in all"
+            )
+    if report.truth:
+        yield from truth_lines(report.truth, "the smoothed states ")
+
+
+def truth_lines(truth: TruthReport, what: str = "") -> Iterator[str]:
     position, heading = truth.position, truth.heading
     offset = math.hypot(position.offset_north_m, position.offset_east_m)
     yield (
-        f"compared with the truth, seconds {truth.start_s:.1f} to {truth.stop_s:.1f}:"
+        f"{what}compared with the truth, seconds {truth.start_s:.1f} to {truth.stop_s:.1f}:"
         f" {truth.rows} states over {truth.distance_m:.0f} m"
     )
     angles = {"heading": heading, "pitch": truth.pitch, "roll": truth.roll}
