@@ -24,7 +24,7 @@ def load(file: str | Path) -> Config:
 def parse(text: str, path: Path = Path("config.toml")) -> Config:
     """Check the text of a configuration file; `path` serves for messages and relative names. Raises ConfigError."""
     config = decode(text, path, Config, directory=str(path.parent))
-    refuse(_contradictions(config), text, path)
+    refuse(contradictions(config), text, path)
     return config
 
 
@@ -40,7 +40,7 @@ def located(file: str | Path) -> Iterator[None]:
         raise ConfigError("\n".join(f"{path}:{line_of(one.partition(': ')[0], text)}: {one}" for one in lines)) from error
 
 
-def _contradictions(config: Config) -> Iterator[tuple[str, str]]:
+def contradictions(config: Config) -> Iterator[tuple[str, str]]:
     """What types cannot express: references between tables, and combinations that make no sense."""
     yield from _contradictions_on_counts(config)
     yield from _contradictions_on_sensors(config)

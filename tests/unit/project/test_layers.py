@@ -21,7 +21,7 @@ LAYERS = (  # from the bottom; those of one line do not import each other
     ("fusiond.timeline", "fusiond.filter", "fusiond.simulation"),
     ("fusiond.estimator",),
     ("fusiond.messages",),
-    ("fusiond.engine",),
+    ("fusiond.engine", "fusiond.arrays"),
     ("fusiond.ports",),
     ("fusiond_adapters",),
     ("fusiond.app",),
