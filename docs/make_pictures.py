@@ -19,6 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the browser, which the tests drive too
+
 from fusiond.app.demo import demo
 from fusiond.app.replay.comparison import Window
 from fusiond.app.replay.files import truth_of
@@ -38,6 +40,7 @@ from fusiond.simulation.scenario import parse
 from fusiond.units import SECOND, nanoseconds
 from fusiond_adapters.logs.merge import open_logs
 from fusiond_adapters.logs.write import write_drive
+from tests.helpers.browser import browser, opened
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
@@ -54,10 +57,10 @@ def figure_of(width: float, height: float) -> Figure:
     return figure
 
 
-def shrink(path: Path) -> None:
+def shrink(path: Path, colours: int = COLOURS, method: Image.Quantize = Image.Quantize.MAXCOVERAGE) -> None:
     """Write a PNG again with a palette."""
     with Image.open(path) as picture:
-        small = picture.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+        small = picture.convert("RGB").quantize(colours, method, dither=Image.Dither.NONE)
     small.save(path, optimize=True)
     print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1e3:.0f} kB")
 
@@ -415,6 +418,27 @@ def draw_top() -> None:
     shrink(path)
 
 
+# --- The report
+
+
+def draw_report() -> None:
+    """The head of a report of the bundled drive, and further down its health and innovations, in the dark."""
+    if browser() is None:
+        print("report.png skipped: needs a browser, chromium", file=sys.stderr)
+        return
+    settings = config.load(demo.DRIVE / "fusiond.toml")
+    logs = [str(demo.DRIVE / log) for log in demo.LOGS]
+    with tempfile.TemporaryDirectory() as folder, opened() as shown:
+        out = Path(folder) / "drive.html"
+        truth = demo.DRIVE / "truth.csv.gz"
+        replay(Options(config=settings, config_name="fusiond.toml", logs=logs, truth=truth, report=out))
+        for name, scheme, first, height in (("report", "light", "overview", 1400), ("report-dark", "dark", "health", 1330)):
+            shown.open(out, width=1200, height=2000, scheme=scheme)
+            path = IMAGES / f"{name}.png"
+            shown.picture(path, f"#{first}", "main", height)
+            shrink(path, 256, Image.Quantize.MEDIANCUT)
+
+
 PICTURES = {
     "rewind": draw_rewind,
     "demo": draw_demo,
@@ -423,6 +447,7 @@ PICTURES = {
     "slip": draw_slip,
     "odometry": draw_odometry,
     "top": draw_top,
+    "report": draw_report,
 }
 
 if __name__ == "__main__":

@@ -11,8 +11,7 @@ from fusiond.app.colours import painted
 from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import positive, rate
 from fusiond.app.commands.arguments import add_config_and_logs, add_verbosity, taken_config
-from fusiond.app.replay.comparison import Window
-from fusiond.app.replay.intervals import parse_interval, parse_withheld
+from fusiond.app.commands.replayed import add_circumstances, circumstances
 from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.outages import parse_length
 from fusiond.app.replay.summary import details, text
@@ -48,18 +47,9 @@ def fill(parser: argparse.ArgumentParser) -> None:
     add_verbosity(parser, quiet="print warnings only, and no bar", verbose="print what was read, and the clocks, too")
     add("--csv", metavar="OUT.csv", type=Path, help="write the track: one row per publication")
     add("--json", metavar="SUMMARY.json", type=Path, help="write the summary")
-    add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
-    add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
-    add("--stored", metavar="STATE.json", type=Path, help="start with the stored state that the recorded run started with")
+    add_circumstances(parser)
     add("--mcap", metavar="OUT.mcap", type=Path, help="write everything published, for Foxglove (extra `mcap`)")
     add("--plot", metavar="OUT.png", type=Path, help="draw the track and, with --truth, its errors (extra `plot`)")
-    add(
-        "--withhold",
-        metavar="SOURCE:START-STOP",
-        action="append",
-        default=[],
-        help="withhold a source between these seconds from the first event, such as gps0:12-22; may be repeated",
-    )
     add(
         "--outage-length",
         metavar="LENGTH",
@@ -77,8 +67,6 @@ def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     name = taken_config(arguments)
     loaded = config.load(name)
-    if arguments.window and not arguments.truth:
-        raise UsageError("--window limits the comparison with a truth: give --truth as well")
     if arguments.outage_length and not arguments.truth:
         raise UsageError("--outage-length compares with a truth: give --truth as well")
     if arguments.publish or arguments.outputs:
@@ -89,12 +77,9 @@ def run(arguments: argparse.Namespace) -> None:
         logs=arguments.logs,
         csv=arguments.csv,
         json=arguments.json,
-        truth=arguments.truth,
         plot=arguments.plot,
         mcap=arguments.mcap,
-        stored=arguments.stored,
-        withheld=tuple(parse_withheld(text, loaded) for text in arguments.withhold),
-        window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
+        **circumstances(arguments, loaded),
         outage_length=parse_length(arguments.outage_length) if arguments.outage_length else None,
         rate_hz=arguments.rate,
         smooth=arguments.smooth is not None,

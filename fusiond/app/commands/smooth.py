@@ -10,12 +10,10 @@ from fusiond.app.colours import painted
 from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import rate
 from fusiond.app.commands.arguments import add_config_and_logs, add_verbosity, taken_config
-from fusiond.app.replay.comparison import Window
-from fusiond.app.replay.intervals import parse_interval, parse_withheld
+from fusiond.app.commands.replayed import add_circumstances, circumstances
 from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.summary import smoothed_lines, text, truth_lines
 from fusiond.config import load as config
-from fusiond.errors import UsageError
 
 ABOUT = """\
 Smooth the logs of one drive: replay them, and then work out each state from all that was measured, before and after it.
@@ -38,16 +36,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
     add_verbosity(parser, quiet="print warnings only, and no bar", verbose="print the summary of the replay, too")
     add("--csv", metavar="OUT.csv", type=Path, help="write the smoothed track: one row for each publication of the replay")
     add("--json", metavar="SUMMARY.json", type=Path, help="write the summary of the replay, with what the smoother gave")
-    add("--truth", metavar="TRUTH.csv", type=Path, help="compare with a reference track (.csv or .csv.gz)")
-    add("--window", metavar="START-STOP", help="compare these seconds only, counted from the first event")
-    add("--stored", metavar="STATE.json", type=Path, help="start with the stored state that the recorded run started with")
-    add(
-        "--withhold",
-        metavar="SOURCE:START-STOP",
-        action="append",
-        default=[],
-        help="withhold a source between these seconds from the first event, such as gps0:12-22; may be repeated",
-    )
+    add_circumstances(parser)
     add("--rate", metavar="HZ", type=rate, help="states per second; default: publish.rate_hz of the config")
 
 
@@ -55,17 +44,12 @@ def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     name = taken_config(arguments)
     loaded = config.load(name)
-    if arguments.window and not arguments.truth:
-        raise UsageError("--window limits the comparison with a truth: give --truth as well")
     options = Options(
         config=loaded,
         config_name=Path(name).name,
         logs=arguments.logs,
         json=arguments.json,
-        truth=arguments.truth,
-        stored=arguments.stored,
-        withheld=tuple(parse_withheld(one, loaded) for one in arguments.withhold),
-        window=Window(*parse_interval(arguments.window)) if arguments.window else Window(),
+        **circumstances(arguments, loaded),
         rate_hz=arguments.rate,
         smooth=True,
         smooth_csv=arguments.csv,

@@ -44,10 +44,12 @@ from fusiond.app.replay.replay import WHOLE, Replay, ReplayTask
 from fusiond.app.replay.smoothed import Smoothing
 from fusiond.app.replay.summary import Summary, to_json
 from fusiond.app.replay.trace import Trace
+from fusiond.app.report.gathered import Gathered
 from fusiond.config.schema import Config
 from fusiond.errors import UsageError
 from fusiond.filter.hot_start import WORDS
 from fusiond.filter.state import Verdict
+from fusiond.messages.info import info_message
 from fusiond_adapters.logs.file import LogError
 from fusiond_adapters.logs.merge import LogSet, open_logs
 
@@ -63,6 +65,8 @@ class Options:
     json: Path | None = None
     truth: Path | None = None
     plot: Path | None = None
+    report: Path | None = None
+    tiles: str | None = None  # address of the tiles of the report's map
     mcap: Path | None = None
     stored: Path | None = None
     withheld: Sequence[Withheld] = ()
@@ -86,14 +90,13 @@ def replay(options: Options) -> Summary:
     if slow := slow_kernel():
         print(f"warning: {slow}", file=sys.stderr)  # at once: a long replay takes hours then
     config, logs = options.config, open_logs(options.logs, options.config)
+    if options.report:
+        config = replace(config, publish=replace(config.publish, innovations=True))
     pacer = Pacer(options.speed) if options.speed else None
     task = ReplayTask(options.rate_hz or config.publish.rate_hz, options.withheld, pace=pacer, window=options.window)
     task.stored_state = stored_state(options.stored, config) if options.stored else None
     task.truth = truth_of(options.truth) if options.truth else None
-    trace = Trace(lambda: run.engine.origin_ns) if options.plot else None
-    if trace:
-        task.on_tick.append(trace.add_tick)
-        task.on_receipt.append(trace.add_receipt)
+    drawings = _Drawings(options, task, lambda: run.engine.origin_ns)
     attached_warnings: list[str] = []
     with ExitStack() as stack:
         _open_files(options, task, stack)
@@ -121,13 +124,42 @@ def replay(options: Options) -> Summary:
     if options.json:
         with delivering(options.json):
             options.json.write_bytes(to_json(summary))
-    if trace and options.plot:
-        from fusiond.app.replay.picture import draw  # noqa: PLC0415 - needs the extra `plot`, slow to import
-
-        trace.read_outcomes()
-        with delivering(options.plot):
-            draw(trace, summary, options.plot)
+    drawings.draw(run, summary)
     return summary
+
+
+class _Drawings:
+    """The picture and the report of a replay, where they are wanted."""
+
+    def __init__(self, options: Options, task: ReplayTask, origin_ns: Callable[[], int]) -> None:
+        self._options = options
+        self._trace = Trace(origin_ns) if options.plot or options.report else None
+        self._gathered = Gathered(options.config, origin_ns) if options.report else None
+        if self._gathered:
+            task.on_tick.append(self._gathered.add_tick)
+            task.on_receipt.append(self._gathered.add_receipt)
+            task.on_message.append(self._gathered.add_message)
+        if self._trace:
+            task.on_tick.append(self._trace.add_tick)
+            task.on_receipt.append(self._trace.add_receipt)
+
+    def draw(self, run: Replay, summary: Summary) -> None:
+        """Write them. Raises OutputError."""
+        options = self._options
+        if self._trace:
+            self._trace.read_outcomes()
+        if self._trace and options.plot:
+            from fusiond.app.replay.picture import draw  # noqa: PLC0415 - needs the extra `plot`, slow to import
+
+            with delivering(options.plot):
+                draw(self._trace, summary, options.plot)
+        if self._trace and self._gathered and options.report:
+            from fusiond.app.report.page import Report, html  # noqa: PLC0415 - needs the extra `report`, slow to import
+
+            self._gathered.finish(run.elapsed_ns, info_message(options.config, run.fusion).sources)
+            page = html(Report(options.config, summary, self._gathered, self._trace, options.tiles))
+            with delivering(options.report):
+                options.report.write_text(page, encoding="utf-8")
 
 
 def _with_outages(options: Options, length: Length, run: Replay, task: ReplayTask, summary: Summary) -> Summary:
@@ -168,12 +200,15 @@ def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
     """Open the files of the ticks. A file that cannot be written is detected before the work begins."""
     check_suffix("--plot", options.plot, ".png")
     check_suffix("--mcap", options.mcap, ".mcap")
-    files = (options.csv, options.json, options.plot, options.mcap, options.smooth_csv)
+    check_suffix("--out", options.report, ".html")
+    files = (options.csv, options.json, options.plot, options.report, options.mcap, options.smooth_csv)
     outputs = [path for path in files if path]
     inputs = [Path(log) for log in options.logs] + [path for path in (options.truth, options.stored) if path]
     check_outputs(outputs, inputs)
     if options.plot and importlib.util.find_spec("matplotlib") is None:
         raise UsageError("--plot needs the extra plot: pip install 'fusiond[plot]'")
+    if options.report and importlib.util.find_spec("bokeh") is None:
+        raise UsageError("a report needs the extra report: pip install 'fusiond[report]'")
     if options.csv:
         task.on_tick.append(csv_file(options.csv, stack))
     if options.mcap:

@@ -71,7 +71,7 @@ class Trace:
         self.fixes: Thinned[FixSample] = Thinned()
         self.rejected: Thinned[FixSample] = Thinned()  # separate, so that thinning does not lose the few
         self._unread: list[tuple[Receipt, FixSample]] = []  # fixes whose outcome has not been read
-        self._origin: tuple[float, float, float] | None = None  # lat, lon [deg], height [m]
+        self.origin: tuple[float, float, float] | None = None  # lat, lon [deg], height [m]; the first position of all
 
     def add_tick(self, message: StateMessage, errors: Errors | None) -> None:
         self.read_outcomes()
@@ -108,7 +108,7 @@ class Trace:
         self._unread.clear()
 
     def _place(self, lat_deg: float, lon_deg: float, height_m: float) -> tuple[float, float]:
-        if self._origin is None:
-            self._origin = lat_deg, lon_deg, height_m
-        lat, lon, height = self._origin
+        if self.origin is None:
+            self.origin = lat_deg, lon_deg, height_m
+        lat, lon, height = self.origin
         return displacement(lat_deg, lon_deg, (lat, lon), height)

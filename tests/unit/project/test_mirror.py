@@ -17,6 +17,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "adapters/mavlink/test_peers.py": "an autopilot made of pymavlink against the daemon",
     "adapters/test_outputs.py": "outputs under the daemon: supervision, isolation, and what is published",
     "config/test_autopilots.py": "the configurations for autopilots, and the autopilots' parameters beside them",
+    "app/report/test_in_a_browser.py": "a whole report in a headless browser",
     "adapters/zenoh/test_security.py": "the sample configurations for TLS and access control",
     "app/commands/test_command_line.py": "all commands, by their command lines",
     "app/commands/test_commands.py": "what every command has in common",

@@ -41,7 +41,7 @@ def test_the_shell_itself_reads_it(shell: str, capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("typed", "expected"),
     [
-        ("rep", {"replay"}),
+        ("repl", {"replay"}),
         ("re", {"replay"} | {name for name in COMMANDS if name.startswith("re")}),
         ("replay --with", {"--withhold"}),
         ("top --on", {"--once"}),
