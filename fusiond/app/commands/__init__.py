@@ -15,6 +15,7 @@ COMMANDS = {
     "replay": "fuse recorded logs into a track",
     "smooth": "smooth recorded logs: each state from all that was measured, before and after it",
     "report": "fuse recorded logs, and write one HTML file that shows the drive and what became of its data",
+    "batch": "replay many drives, and tell whether a configuration is better on them",
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
     "check": "explain what a configuration does, or what is wrong with it",
     "mount": "estimate the mounting angles of the IMU from logs",

@@ -22,6 +22,13 @@ def rate(text: str) -> float:
     return value
 
 
+def count(text: str) -> int:
+    """A whole number, at least 1."""
+    if not (text.isascii() and text.isdigit() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
+    return int(text)
+
+
 def seed(text: str) -> int:
     """A whole number, at least 0."""
     if not (text.isascii() and text.isdigit()):

@@ -1,0 +1,167 @@
+"""A whole batch: drives are found, planned, measured, and summed up. A killed batch goes on where it was."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO
+
+from fusiond.app.batch import keys
+from fusiond.app.batch.drives import find
+from fusiond.app.batch.engines import Engine
+from fusiond.app.batch.findings import Findings, Keyed, gather
+from fusiond.app.batch.job import Answer, Job, Limits, Options
+from fusiond.app.batch.page import page
+from fusiond.app.batch.row import Row
+from fusiond.app.batch.store import Cost, Store
+from fusiond.app.batch.table import read_rows, write_rows
+from fusiond.app.replay.files import delivering
+from fusiond.errors import UnusableError, UsageError
+
+NEW, BASELINE = "new", "baseline"  # roles
+OWN = "own"  # in place of a configuration: the one that lies beside each drive
+DRAWN_S = 0.2  # between two drawings of the progress
+ROWS, SUMMARY, TRACKS = "rows.parquet", "summary.html", "tracks"
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """The arguments of a batch."""
+
+    drives: Sequence[str]
+    folder: Path
+    config: str = OWN
+    baseline: str | None = None  # a configuration, OWN, or the rows of another batch
+    options: Options = field(default_factory=Options)
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a batch gives besides its files."""
+
+    findings: Findings
+    made: int  # rows that were made by this run; the others were there
+    cost: Cost
+
+
+def run(order: Order, engine: Engine, progress: TextIO = sys.stderr) -> Result:
+    """Run a batch to its end. Raises UsageError, UnusableError, OutputError."""
+    with Store(order.folder) as store:
+        plan(order, store)
+        left = store.left()
+        _measure(store, engine, left, progress)
+        with delivering(order.folder / ROWS):
+            write_rows(order.folder / ROWS, store.rows(NEW))
+            if _of_rows(order.baseline) is None and order.baseline is not None:
+                write_rows(order.folder / f"{BASELINE}.parquet", store.rows(BASELINE))
+        findings = gather(store.rows(NEW), _baseline(order, store))
+        with delivering(order.folder / SUMMARY):
+            text = page(findings, _title(order), {})
+            (order.folder / SUMMARY).write_text(text, encoding="utf-8")
+        return Result(findings, left, store.cost())
+
+
+def plan(order: Order, store: Store) -> None:
+    """Find the drives and the keys of their rows. Raises UsageError, UnusableError."""
+    roles = [(NEW, order.config)]
+    if order.baseline is not None and _of_rows(order.baseline) is None:
+        roles.append((BASELINE, order.baseline))
+    configurations = {config: None if config == OWN else keys.of_configuration(config) for _, config in roles}
+    store.begin_plan()
+    for drive in find(order.drives):
+        for role, config in roles:
+            key = keys.of_row(drive, configurations[config], order.options)
+            path = "" if config == OWN else str(Path(config).absolute())
+            track = str((order.folder / TRACKS / f"{key}.parquet").absolute()) if order.options.tracks else ""
+            job = Job(drive=drive, config=path, options=order.options, limits=order.limits, track=track)
+            store.plan(role, drive.name, key, job)
+    store.end_plan(order.limits)
+
+
+def _of_rows(baseline: str | None) -> Path | None:
+    """The file of rows that a baseline names, if it names one."""
+    return Path(baseline) if baseline is not None and baseline.endswith(".parquet") else None
+
+
+def _baseline(order: Order, store: Store) -> Iterator[Keyed] | None:
+    if order.baseline is None:
+        return None
+    rows = _of_rows(order.baseline)
+    return store.rows(BASELINE) if rows is None else read_rows(rows)
+
+
+def _measure(store: Store, engine: Engine, left: int, progress: TextIO) -> None:
+    """Make the rows that are missing; each is kept as soon as it is there."""
+    jobs: dict[str, Job] = {}  # that were taken by the engine
+
+    def pending() -> Iterator[tuple[str, Job]]:
+        for key, job in store.pending():
+            jobs[key] = job
+            yield key, job
+
+    with _Progress(left, progress) as shown:
+        for key, answer in engine.answers(pending()):
+            store.put(key, _row(jobs.pop(key), answer), answer.cpu_s, answer.peak_mb)
+            shown.step()
+
+
+def _row(job: Job, answer: Answer) -> Row:
+    return answer.row or Row(status=answer.status, reason=answer.reason, **job.known())
+
+
+def _title(order: Order) -> str:
+    new = "each drive's own configuration" if order.config == OWN else Path(order.config).name
+    if order.baseline is None:
+        return f"fusiond batch: {new}"
+    old = "each drive's own configuration" if order.baseline == OWN else Path(order.baseline).name
+    return f"fusiond batch: {new} against {old}"
+
+
+class _Progress:
+    """The number of finished rows, on a terminal."""
+
+    def __init__(self, total: int, stream: TextIO) -> None:
+        self._total, self._stream = total, stream
+        self._done, self._begun, self._drawn = 0, time.monotonic(), 0.0
+
+    def step(self) -> None:
+        self._done += 1
+        now = time.monotonic()
+        if self._stream.isatty() and now - self._drawn >= DRAWN_S:
+            self._drawn = now
+            left_s = (self._total - self._done) * (now - self._begun) / self._done
+            self._stream.write(f"\r\x1b[K{self._done} of {self._total} rows, {left_s / 60:.0f} min left")
+            self._stream.flush()
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._stream.isatty():
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
+
+
+def dry(order: Order) -> str:
+    """What a batch would do, in words; nothing is written but the plan."""
+    with ExitStack() as stack:
+        store = stack.enter_context(Store(order.folder))
+        plan(order, store)
+        drives, left = store.planned(NEW), store.left()
+        return f"{drives} drives; {left} rows to be made, the others are there"
+
+
+def check(order: Order) -> None:
+    """Check what can be checked before the work begins. Raises UsageError, UnusableError."""
+    rows = _of_rows(order.baseline)
+    if rows is not None:
+        if not rows.is_file():
+            raise UnusableError(f"{rows}: there is no such file")
+        if rows.resolve() == (order.folder / ROWS).resolve():
+            raise UsageError(f"{rows}: would be overwritten; give another folder by -o")
+        next(read_rows(rows), None)

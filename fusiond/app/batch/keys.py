@@ -1,0 +1,55 @@
+"""The key of a row: a hash of everything that it follows from: files, configuration, options, version."""
+
+from __future__ import annotations
+
+import hashlib
+
+import msgspec
+
+from fusiond import __version__
+from fusiond.app.batch import storage
+from fusiond.app.batch.job import Drive, DriveFile, Options
+from fusiond.app.batch.row import LAYOUT
+from fusiond.config import load
+from fusiond.config.toml import ConfigError
+from fusiond.errors import UnusableError
+
+
+def of_configuration(path: str) -> str:
+    """The digest of a configuration and of the DBC files that it names. Raises ConfigError, UnusableError."""
+    config = load.load(path)
+    files = [path, *(str(config.path(dbc)) for bus in config.can.values() for dbc in bus.dbc)]
+    return _hash([storage.digest(file) for file in files])
+
+
+def of_row(drive: Drive, configuration: str | None, options: Options) -> str:
+    """The key of the row of a drive by a configuration with this digest; None: the drive's own."""
+    if configuration is None:
+        configuration = _own(drive)
+    files = [_about(file) for file in (*drive.logs, *filter(None, (drive.truth, drive.stored)))]
+    return _hash([__version__, LAYOUT, msgspec.json.encode(options).decode(), configuration, *files])
+
+
+def _own(drive: Drive) -> str:
+    """The digest of a drive's own configuration. What is wrong with it is told in the row."""
+    if drive.config is None:
+        return ""
+    files = [drive.config, *drive.beside]
+    if not drive.config.is_remote and not drive.beside:
+        try:
+            return f"{drive.config.name} {of_configuration(drive.config.where)}"
+        except ConfigError:
+            pass
+    return " ".join(_about(file) for file in files)
+
+
+def _about(file: DriveFile) -> str:
+    """What a file adds to a key. That one cannot be read is told in the row."""
+    try:
+        return f"{file.name} {file.link} {storage.digest(file.where)}"
+    except UnusableError:
+        return f"{file.name} {file.link} not readable"
+
+
+def _hash(parts: list[object]) -> str:
+    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]

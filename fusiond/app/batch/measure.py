@@ -1,0 +1,208 @@
+"""Measuring one drive: its files are fetched, replayed, compared with the reference, and told as a row.
+
+Everything in a row follows from the files, the configuration and the version: no clock of this machine is read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from fusiond.app.batch.job import Drive, DriveFile, Job
+from fusiond.app.batch.outages import Course, Outages, intervals, parse_length, percentile, shares
+from fusiond.app.batch.row import CalibrationRow, OutageRow, Row, SourceRow
+from fusiond.app.replay.files import short_names, stored_state, truth_of, with_short_names
+from fusiond.app.replay.replay import Replay, ReplayTask
+from fusiond.app.replay.summary import Summary
+from fusiond.config import load
+from fusiond.config.schema import Config
+from fusiond.errors import UnusableError, UsageError
+from fusiond.estimator.solution import Mode
+from fusiond.filter.calibration import calibrations
+from fusiond_adapters.logs.merge import LogSet, open_logs
+
+
+class NoTrack(UnusableError):
+    """The logs were read, and gave no state; the message says why."""
+
+
+def measure(job: Job) -> Row:
+    """The row of a job; what cannot be used is told in it. Other exceptions are faults of the program."""
+    known = job.known()
+    with ExitStack() as stack:
+        folders: dict[str, str] = {}
+        try:
+            files = stack.enter_context(_at_hand(job.drive))
+            folders = {f"{path.parent}/": "" for path in files.values()}
+            return _Measurement(job, files, known).row()
+        except (UnusableError, UsageError) as error:
+            return Row(status="failed", reason=with_short_names(str(error), folders), **known)
+        except OSError as error:
+            return Row(status="failed", reason=with_short_names(_in_words(error), folders), **known)
+
+
+def _in_words(error: OSError) -> str:
+    return f"{Path(error.filename).name}: {error.strerror}" if error.filename else str(error) or type(error).__name__
+
+
+# --- Files
+
+
+@contextmanager
+def _at_hand(drive: Drive) -> Iterator[dict[str, Path]]:
+    """Inside the block: where each file of a drive can be read, by its name. Remote files are fetched into a folder of their
+    own; so is a configuration whose files lie under other names than it says."""
+    with TemporaryDirectory(prefix="fusiond-") as name:
+        folder = Path(name)
+        yield {file.name: _fetched(file, folder, together=bool(drive.beside)) for file in drive.files()}
+
+
+def _fetched(file: DriveFile, folder: Path, *, together: bool) -> Path:
+    if file.is_remote:
+        from fusiond.app.batch.storage import fetch  # noqa: PLC0415 - needs the extra `batch`
+
+        return fetch(file.where, folder / file.name)
+    path = Path(file.where)
+    if together:
+        (folder / file.name).symlink_to(path.absolute())
+        return folder / file.name
+    return path
+
+
+# --- The replays of one drive
+
+
+class _Measurement:
+    def __init__(self, job: Job, files: dict[str, Path], known: dict[str, Any]) -> None:
+        self._job, self._files, self._known = job, files, known
+        self._logs = job.drive.logs
+        own = job.drive.config
+        if not job.config and own is None:
+            raise UnusableError("no configuration lies beside the logs, and none was given")
+        self._config: Config = load.load(job.config or files[own.name if own else ""])
+        self._truth_file = files[job.drive.truth.name] if job.drive.truth else None
+
+    def row(self) -> Row:
+        course, track = Course(), None
+        task = self._task()
+        task.on_tick.append(course.add)
+        with ExitStack() as stack:
+            if self._job.track:
+                from fusiond.app.batch.track import TrackFile  # noqa: PLC0415 - needs the extra `batch`
+
+                track = stack.enter_context(TrackFile(Path(self._job.track)))
+                task.on_tick.append(track.add)
+            run, logs = self._run(task)
+            if run.first_ns is None:
+                found = "; ".join(f"{Path(path).name}: {counts}" for path, counts in logs.counts.items())
+                raise NoTrack(f"nothing in the logs that the configuration asks for ({found})")
+            names = short_names(logs.counts)
+            counts = {names[path]: count for path, count in logs.counts.items()}
+            warnings = [with_short_names(warning, names) for warning in logs.warnings]
+            summary = run.summary(str(self._known["config"]), counts, warnings)
+            if not course:
+                raise NoTrack(f"no state: {summary.final.fault or 'the filter never had enough data to start'}")
+        outages = self._outages(run, course)
+        return self._told(summary, run, course, outages, Path(self._job.track).name)
+
+    def _task(self) -> ReplayTask:
+        truth = truth_of(self._truth_file) if self._truth_file else None
+        stored = self._job.drive.stored
+        return ReplayTask(
+            self._job.options.rate_hz,
+            truth=truth,
+            stored_state=stored_state(self._files[stored.name], self._config) if stored else None,
+        )
+
+    def _run(self, task: ReplayTask) -> tuple[Replay, LogSet]:
+        paths = [f"{log.link}={self._files[log.name]}" if log.link else self._files[log.name] for log in self._logs]
+        logs = open_logs(paths, self._config)
+        run = Replay(self._config, task)
+        run.run(logs)
+        return run, logs
+
+    def _outages(self, run: Replay, course: Course) -> list[OutageRow]:
+        """A second replay, with GNSS withheld again and again."""
+        if not self._job.options.outage:
+            return []
+        spells = intervals(course, parse_length(self._job.options.outage))
+        if not spells or run.first_ns is None:
+            return []
+        outages = Outages(spells, course, run.first_ns)
+        task = self._task()
+        task.withheld = outages.withheld(self._config)
+        task.on_tick.append(outages.add)
+        self._run(task)
+        return outages.rows
+
+    def _told(self, summary: Summary, run: Replay, course: Course, outages: Sequence[OutageRow], track: str) -> Row:
+        truth, published = summary.truth, summary.published
+        position = truth.position if truth else None
+        rows = published.rows if published else 0
+        modes = {mode: published.modes.get(mode.value, 0) / rows if published and rows else None for mode in Mode}
+        late = [source.latency_ms.p99 for source in summary.sources.values() if source.latency_ms]
+        drifts = shares(outages)
+        return Row(
+            status="ok",
+            **self._known,
+            vehicle=summary.vehicle,
+            seconds=summary.span.seconds,
+            distance_m=truth.distance_m if truth else course.distance_m,
+            events=summary.events,
+            warnings=summary.warnings,
+            reference="truth" if truth else "",
+            position_rmse_m=position.rmse_m if position else None,
+            position_p95_m=position.p95_m if position else None,
+            position_max_m=position.max_m if position else None,
+            position_end_m=position.end_m if position else None,
+            inside_95=position.inside_95 if position else None,
+            nees=position.nees if position else None,
+            height_rmse_m=truth.height_rmse_m if truth else None,
+            velocity_rmse_mps=truth.velocity_rmse_mps if truth else None,
+            heading_rmse_deg=truth.heading.rmse_deg if truth else None,
+            outages=list(outages),
+            outage_68_percent=percentile(drifts, 0.68),
+            outage_max_percent=drifts[-1] if drifts else None,
+            states=rows,
+            aligning=modes[Mode.ALIGNING],
+            nominal=modes[Mode.NOMINAL],
+            dead_reckoning=modes[Mode.DEAD_RECKONING],
+            lost=modes[Mode.LOST],
+            resets=summary.final.resets,
+            latency_p99_ms=max(late, default=None),
+            sources=_sources(summary, run),
+            calibration=_calibration(run),
+            track=track,
+        )
+
+
+def _sources(summary: Summary, run: Replay) -> list[SourceRow]:
+    beliefs = run.fusion.health(run.engine.now_ns)
+    return [
+        SourceRow(
+            name=name,
+            events=one.events,
+            fused=one.fused,
+            rejected=one.rejected,
+            too_old=one.too_old,
+            invalid=one.invalid,
+            latency_p50_ms=one.latency_ms.p50 if one.latency_ms else None,
+            latency_p99_ms=one.latency_ms.p99 if one.latency_ms else None,
+            status=beliefs[name].status,
+            remark=one.remark or beliefs[name].reason,
+        )
+        for name, one in summary.sources.items()
+    ]
+
+
+def _calibration(run: Replay) -> list[CalibrationRow]:
+    found = calibrations(run.fusion.params, run.fusion.history.head)
+    return [
+        CalibrationRow(name=name, value=value, sigma=sigma)
+        for name, (value, sigma) in found.items()
+        if math.isfinite(value) and math.isfinite(sigma)
+    ]

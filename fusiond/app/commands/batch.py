@@ -1,0 +1,83 @@
+"""fusiond batch: replays many drives, and tells whether a configuration is better on them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fusiond.app.batch import batch
+from fusiond.app.batch.batch import OWN, ROWS, SUMMARY, Order
+from fusiond.app.batch.engines import Cluster, Engine, LocalPool, cores
+from fusiond.app.batch.job import Limits, Options
+from fusiond.app.batch.outages import parse_length
+from fusiond.app.batch.summary import text
+from fusiond.app.commands import EXIT_CODES
+from fusiond.app.commands.argument_types import count, positive, rate
+
+WORSE = 3  # exit code
+
+ABOUT = """\
+Replay many drives, each in a process with limits of its own, and write one row for each, whatever happens to it, as
+Parquet. With a baseline, tell whether the new configuration is significantly better or worse over all drives, and which
+drives are worst. Rows that are there already are not made again: a batch that was killed goes on where it was."""
+EXAMPLES = """\
+examples:
+  fusiond batch drives/ --config car.toml -o out
+      every folder of logs below drives/, compared with the truth.csv beside them
+  fusiond batch drives/ --config new.toml --baseline old.toml -o out
+      is new.toml better? exit code 3 if it is significantly worse
+  fusiond batch 's3://fleet/2026-03-*/' -o out --outage 1000m
+      recordings of black boxes as they lie, each with the configuration that it was recorded with
+  fusiond batch drives/ --config car.toml -o new --baseline old/rows.parquet
+      compare with the rows of another version of fusiond
+  fusiond batch manifest.csv --config car.toml -o out --scheduler tcp://10.0.0.5:8786
+      drives listed in a table, on a Dask cluster
+"""
+
+
+def fill(parser: argparse.ArgumentParser) -> None:
+    """Define the arguments."""
+    parser.description = ABOUT
+    parser.epilog = f"{EXAMPLES}\n{EXIT_CODES}, {WORSE} NEW is significantly worse than OLD"
+    add = parser.add_argument
+    add("drives", metavar="DRIVES", nargs="+", help="folders, patterns, logs, manifests (.csv, .parquet), or URLs of them")
+    add("--config", metavar="NEW.toml", default=OWN, help="default: the one that lies beside each drive's logs")
+    add("--baseline", metavar="OLD", help=f"a configuration, '{OWN}', or rows.parquet of another batch, to compare with")
+    add("-o", "--out", metavar="DIR", type=Path, required=True, help="folder to write to; created if missing")
+    add("--outage", metavar="LENGTH", default="", help="replay again with GNSS withheld again and again, for 60s or 1000m")
+    add("--rate", metavar="HZ", type=rate, default=10.0, help="states a second that are compared; default: %(default)g")
+    add("--tracks", action="store_true", help="write the tracks too, as Parquet")
+    add("--workers", metavar="N", type=count, default=cores(), help="processes; default: the processors, here %(default)s")
+    add("--engine", choices=("local", "dask"), default="local", help="dask: a Dask cluster on this machine (extra `dask`)")
+    add("--scheduler", metavar="URL", help="the scheduler of a Dask cluster, such as tcp://HOST:8786 (extra `dask`)")
+    add("--seconds", metavar="S", type=positive, default=600.0, help="processor time of one drive; default: %(default)g")
+    add("--memory", metavar="MB", type=positive, default=2000.0, help="memory of one drive; default: %(default)g")
+    add("--dry-run", action="store_true", help="tell what would be done")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    if arguments.outage:
+        parse_length(arguments.outage)
+    options = Options(rate_hz=arguments.rate, outage=arguments.outage, tracks=arguments.tracks)
+    limits = Limits(seconds=arguments.seconds, memory_mb=arguments.memory)
+    order = Order(arguments.drives, arguments.out, arguments.config, arguments.baseline, options, limits)
+    batch.check(order)
+    if arguments.dry_run:
+        print(batch.dry(order))
+        return 0
+    with _engine(arguments) as engine:
+        result = batch.run(order, engine)
+    print(text(result.findings))
+    cost = result.cost
+    print(
+        f"\n{result.made} of {cost.rows} rows were made now; all cost {cost.cpu_s:.0f} s of processor time,"
+        f" the largest {cost.peak_mb:.0f} MB\n{order.folder / ROWS}\n{order.folder / SUMMARY}"
+    )
+    return WORSE if result.findings.comparison is not None and result.findings.comparison.is_worse else 0
+
+
+def _engine(arguments: argparse.Namespace) -> Engine:
+    if arguments.scheduler or arguments.engine == "dask":
+        return Cluster(arguments.scheduler, arguments.workers)
+    return LocalPool(arguments.workers)
