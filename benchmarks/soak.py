@@ -159,7 +159,7 @@ def replayed(settings: Config, box: Path, digests: Path) -> tuple[int, int]:
             count += 1
             other += file.read(DIGEST) != digest(message)
 
-        logs = [str(path) for path in sorted(box.iterdir())]
+        logs = [str(path) for path in sorted(box.glob("*log"))]
         Replay(settings, ReplayTask(settings.publish.rate_hz, on_tick=[compare])).run(open_logs(logs, settings))
     return count, other
 

@@ -28,12 +28,14 @@ def sync_folder(folder: Path) -> None:
 
 
 class BoundedFolder:
-    """One recording in a folder. `kind` is a regular expression of the kinds of files; no other file is ever removed."""
+    """One recording in a folder. `kind` is a regular expression of the kinds of files; no other file is ever removed. Those
+    of the kind `kept` are removed last of a recording."""
 
-    def __init__(self, folder: Path, kind: str, file_bytes: int, total_bytes: int) -> None:
+    def __init__(self, folder: Path, kind: str, file_bytes: int, total_bytes: int, kept: str = "") -> None:
         self.path = folder
         self.removed = 0  # files of this recording, for lack of any that are older
-        self._name = re.compile(rf"(?:(\d{{4,}})-)?(\d{{8}}T\d{{6}}\.\d{{6}})Z-{kind}")
+        self._name = re.compile(rf"(?:(\d{{4,}})-)?(\d{{8}}T\d{{6}}\.\d{{6}})Z-({kind})")
+        self._kept = re.compile(kept)
         self._file_bytes, self._total_bytes = file_bytes, total_bytes
         self._number: int | None = None  # of this recording, from its first file on
 
@@ -48,15 +50,17 @@ class BoundedFolder:
         stamp = f"{instant:%Y%m%dT%H%M%S}.{t_ns % SECOND // MICROSECOND:06d}"
         return self.path / f"{self._number:04d}-{stamp}Z-{kind}"
 
-    def _files(self) -> list[tuple[int, str, Path]]:
-        """Number of the recording, instant and path of each file, oldest first."""
+    def _files(self) -> list[tuple[int, bool, str, Path]]:
+        """Number of the recording, whether it is removed last, instant and path of each file, in the order of removal."""
         found = [(self._name.fullmatch(path.name), path) for path in self.path.iterdir()]
-        return sorted((int(name[1] or 0), name[2], path) for name, path in found if name)
+        return sorted(
+            (int(name[1] or 0), bool(self._kept.fullmatch(name[3])), name[2], path) for name, path in found if name
+        )
 
-    def _make_room(self, files: list[tuple[int, str, Path]], open_files: Set[Path]) -> None:
+    def _make_room(self, files: list[tuple[int, bool, str, Path]], open_files: Set[Path]) -> None:
         sizes = {path: self._file_bytes if path in open_files else path.stat().st_size for *_, path in files}
         total = sum(sizes.values()) + self._file_bytes
-        for number, _, path in files:
+        for number, *_, path in files:
             if total <= self._total_bytes:
                 return
             if path not in open_files:

@@ -1,7 +1,8 @@
 """The black box: records everything received, in native formats, in a folder of bounded size.
 
-A file is named by the number of the recording, the instant of its first frame, and `LINK.tlog`, `can.log`, or `state.json`
-for the stored state that the run started with. The caller never waits: a thread writes the frames, and each second syncs
+A file is named by the number of the recording, the instant of its first frame, and `LINK.tlog`, `can.log`; `config.json` and
+`BUS_N.dbc` for the configuration that was used, or `state.json` for the stored state that the run started with. These stay
+for as long as there is a frame of the recording. The caller never waits: a thread writes the frames, and each second syncs
 them to the disk. Only then do they count as written. If the disk is full or slow, only the black box loses frames: it counts
 them, and starts a new file as soon as possible.
 """
@@ -21,7 +22,7 @@ from fusiond_adapters.host.bounded_folder import FLUSH_S, MEGABYTE, BoundedFolde
 MAX_WAITING = 100_000  # records between the engine and the disk
 GATHERED = 1 << 16  # bytes that are written at once
 RETRY_NS = 5 * SECOND  # pause after an error; records of that time are lost
-KIND = r"\w+\.(?:tlog|log|json)"
+KIND, KEPT = r"\w+\.(?:tlog|log|json|dbc)", r"\w+\.(?:json|dbc)"
 
 
 class Recorder:
@@ -36,7 +37,7 @@ class Recorder:
         self.error: str | None = None  # the last one, until a write succeeds
         self._overflowed = self._lost = 0  # records: counted by the caller's thread, and by its own
         self._file_bytes = int(file_mb * MEGABYTE)
-        self._folder = BoundedFolder(folder, KIND, self._file_bytes, int(total_mb * MEGABYTE))
+        self._folder = BoundedFolder(folder, KIND, self._file_bytes, int(total_mb * MEGABYTE), KEPT)
         self._files: dict[str, _File] = {}  # open ones, by kind
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         self._changed = Condition()

@@ -1,4 +1,4 @@
-"""Reading the configuration: from a TOML file to its tables, and the contradictions between them."""
+"""Reading the configuration: from a TOML file, or a black box's JSON, to its tables, and the contradictions between them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fusiond.config import recorded
 from fusiond.config.schema import MAX_SCALES, Config, calibrated, sensor_tables, wheel_groups
 from fusiond.config.sensor import INPUTS
 from fusiond.config.toml import ConfigError, decode, line_of, meant, read_text, refuse
@@ -25,6 +26,9 @@ def parse(text: str, path: Path = Path("config.toml")) -> Config:
     """Check the text of a configuration file; `path` serves for messages and relative names. Raises ConfigError."""
     config = decode(text, path, Config, directory=str(path.parent))
     refuse(contradictions(config), text, path)
+    kept = path.suffix == ".json"
+    config = recorded.parse(text, path) if kept else decode(text, path, Config, directory=str(path.parent))
+    refuse(_contradictions(config), text, path)
     return config
 
 

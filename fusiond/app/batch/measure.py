@@ -6,23 +6,27 @@ Everything in a row follows from the files, the configuration and the version: n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from fusiond.app.batch.job import Drive, DriveFile, Job
-from fusiond.app.batch.outages import Course, Outages, intervals, parse_length, percentile, shares
-from fusiond.app.batch.row import CalibrationRow, OutageRow, Row, SourceRow
+from fusiond.app.batch.row import CalibrationRow, Row, SourceRow
+from fusiond.app.replay.comparison import Errors
 from fusiond.app.replay.files import short_names, stored_state, truth_of, with_short_names
+from fusiond.app.replay.outages import RECOVERY_S, OutageLog, OutageReport, course, parse_length, plan, report, withheld
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.summary import Summary
+from fusiond.app.replay.truth import Truth, TruthSample
 from fusiond.config import load
 from fusiond.config.schema import Config
 from fusiond.errors import UnusableError, UsageError
 from fusiond.estimator.solution import Mode
 from fusiond.filter.calibration import calibrations
+from fusiond.messages import StateMessage
+from fusiond.units import SECOND
 from fusiond_adapters.logs.merge import LogSet, open_logs
 
 
@@ -76,6 +80,31 @@ def _fetched(file: DriveFile, folder: Path, *, together: bool) -> Path:
 # --- The replays of one drive
 
 
+class Course:
+    """How many states a replay gave, how far the vehicle came, and if it `keeps` them, where they were: a reference for a
+    replay without GNSS. Of sessions that step back only what is later than all before counts."""
+
+    def __init__(self, *, keeps: bool) -> None:
+        self.states = 0
+        self.distance_m = 0.0  # by the published velocities
+        self.samples: list[TruthSample] = []
+        self._keeps, self._last_ns = keeps, 0
+
+    def add(self, message: StateMessage, _: Errors | None) -> None:
+        """Add a published state."""
+        state = message.state
+        if state is None or message.t_ns <= self._last_ns:
+            return
+        north, east, _down = state.velocity_ned_mps
+        if self.states:
+            self.distance_m += math.hypot(north, east) * (message.t_ns - self._last_ns) / SECOND
+        self.states += 1
+        self._last_ns = message.t_ns
+        if self._keeps:
+            place = state.lat_deg, state.lon_deg, state.height_m
+            self.samples.append(TruthSample(message.t_ns, *place, north, east, state.yaw_deg))
+
+
 class _Measurement:
     def __init__(self, job: Job, files: dict[str, Path], known: dict[str, Any]) -> None:
         self._job, self._files, self._known = job, files, known
@@ -87,9 +116,9 @@ class _Measurement:
         self._truth_file = files[job.drive.truth.name] if job.drive.truth else None
 
     def row(self) -> Row:
-        course, track = Course(), None
+        first, track = Course(keeps=bool(self._job.options.outage)), None
         task = self._task()
-        task.on_tick.append(course.add)
+        task.on_tick.append(first.add)
         with ExitStack() as stack:
             if self._job.track:
                 from fusiond.app.batch.track import TrackFile  # noqa: PLC0415 - needs the extra `batch`
@@ -104,10 +133,10 @@ class _Measurement:
             counts = {names[path]: count for path, count in logs.counts.items()}
             warnings = [with_short_names(warning, names) for warning in logs.warnings]
             summary = run.summary(str(self._known["config"]), counts, warnings)
-            if not course:
+            if not first.states:
                 raise NoTrack(f"no state: {summary.final.fault or 'the filter never had enough data to start'}")
-        outages = self._outages(run, course)
-        return self._told(summary, run, course, outages, Path(self._job.track).name)
+        outages = self._outages(run, first) if self._job.options.outage else None
+        return self._told(summary, run, first, outages, Path(self._job.track).name)
 
     def _task(self) -> ReplayTask:
         truth = truth_of(self._truth_file) if self._truth_file else None
@@ -125,33 +154,32 @@ class _Measurement:
         run.run(logs)
         return run, logs
 
-    def _outages(self, run: Replay, course: Course) -> list[OutageRow]:
-        """A second replay, with GNSS withheld again and again."""
-        if not self._job.options.outage:
-            return []
-        spells = intervals(course, parse_length(self._job.options.outage))
-        if not spells or run.first_ns is None:
-            return []
-        outages = Outages(spells, course, run.first_ns)
-        task = self._task()
-        task.withheld = outages.withheld(self._config)
-        task.on_tick.append(outages.add)
+    def _outages(self, run: Replay, first: Course) -> OutageReport | None:
+        """A second replay, with GNSS withheld again and again; None if the drive is too short for one outage."""
+        length, task = parse_length(self._job.options.outage), self._task()
+        task.truth = task.truth or Truth(first.samples)
+        begin_s = (run.first_nominal_s if run.first_nominal_s is not None else math.inf) + RECOVERY_S
+        stretches = next(iter(plan(course(task.truth, run.engine.origin_ns), length, begin_s)), [])
+        if not stretches or run.engine.steps_back:
+            return None
+        log = OutageLog(stretches)
+        task.withheld = withheld(stretches, self._config)
+        task.on_tick.append(lambda state, errors: log.add(state.t_ns - run.engine.origin_ns, state, errors))
         self._run(task)
-        return outages.rows
+        return report(length, log.ends())
 
-    def _told(self, summary: Summary, run: Replay, course: Course, outages: Sequence[OutageRow], track: str) -> Row:
+    def _told(self, summary: Summary, run: Replay, first: Course, outages: OutageReport | None, track: str) -> Row:
         truth, published = summary.truth, summary.published
         position = truth.position if truth else None
         rows = published.rows if published else 0
         modes = {mode: published.modes.get(mode.value, 0) / rows if published and rows else None for mode in Mode}
         late = [source.latency_ms.p99 for source in summary.sources.values() if source.latency_ms]
-        drifts = shares(outages)
         return Row(
             status="ok",
             **self._known,
             vehicle=summary.vehicle,
             seconds=summary.span.seconds,
-            distance_m=truth.distance_m if truth else course.distance_m,
+            distance_m=truth.distance_m if truth else first.distance_m,
             events=summary.events,
             warnings=summary.warnings,
             reference="truth" if truth else "",
@@ -164,9 +192,9 @@ class _Measurement:
             height_rmse_m=truth.height_rmse_m if truth else None,
             velocity_rmse_mps=truth.velocity_rmse_mps if truth else None,
             heading_rmse_deg=truth.heading.rmse_deg if truth else None,
-            outages=list(outages),
-            outage_68_percent=percentile(drifts, 0.68),
-            outage_max_percent=drifts[-1] if drifts else None,
+            outages=outages.outages if outages else [],
+            outage_68_percent=outages.p68_percent if outages else None,
+            outage_max_percent=outages.max_percent if outages else None,
             states=rows,
             aligning=modes[Mode.ALIGNING],
             nominal=modes[Mode.NOMINAL],

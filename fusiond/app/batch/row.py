@@ -6,6 +6,8 @@ from typing import Literal
 
 from msgspec import Struct
 
+from fusiond.app.replay.outages import Outage
+
 LAYOUT = 1  # raised when a column is removed or changes its meaning: rows of another layout are made anew
 
 Status = Literal["ok", "failed", "timed out", "out of memory", "crashed"]
@@ -34,16 +36,6 @@ class CalibrationRow(Struct, frozen=True, kw_only=True):
     sigma: float
 
 
-class OutageRow(Struct, frozen=True, kw_only=True):
-    """A stretch in which GNSS was withheld, and the horizontal error at its end."""
-
-    start_s: float  # from the first event
-    stop_s: float
-    distance_m: float  # travelled in it
-    error_m: float
-    sigma_m: float  # root sum of squares of the north and east sigma
-
-
 class Row(Struct, frozen=True, kw_only=True):
     """One drive by one configuration. What is not known is None; of a drive that is not ok only the reason is known."""
 
@@ -69,8 +61,8 @@ class Row(Struct, frozen=True, kw_only=True):
     height_rmse_m: float | None = None
     velocity_rmse_mps: float | None = None  # horizontal
     heading_rmse_deg: float | None = None  # mean offset removed
-    # Outages: GNSS withheld again and again in a second replay
-    outages: list[OutageRow] = []
+    # Outages: GNSS withheld again and again in a second replay; errors against the truth, or without one the first replay
+    outages: list[Outage] = []
     outage_68_percent: float | None = None  # 68 % of the errors are at most this share of the distance [%]
     outage_max_percent: float | None = None
     # Health

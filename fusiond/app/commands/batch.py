@@ -9,10 +9,10 @@ from fusiond.app.batch import batch
 from fusiond.app.batch.batch import OWN, ROWS, SUMMARY, Order
 from fusiond.app.batch.engines import Cluster, Engine, LocalPool, cores
 from fusiond.app.batch.job import Limits, Options
-from fusiond.app.batch.outages import parse_length
 from fusiond.app.batch.summary import text
 from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import count, positive, rate
+from fusiond.app.replay.outages import parse_length
 
 WORSE = 3  # exit code
 

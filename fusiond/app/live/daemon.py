@@ -22,6 +22,7 @@ from fusiond.app.live.live_engine import LiveEngine
 from fusiond.app.live.quiet import Quiet
 from fusiond.app.outputs import Outputs
 from fusiond.app.state_file import StateFile
+from fusiond.config import recorded
 from fusiond.config.changes import changes
 from fusiond.config.schema import Config
 from fusiond.config.toml import ConfigError
@@ -306,11 +307,15 @@ class Daemon:
         return None
 
     def _make_recorder(self, config: Config) -> Recorder | None:
-        """The recorder of a configuration; None if nothing shall be recorded. Raises OSError."""
+        """The recorder of a configuration, which it keeps first; None if nothing shall be recorded. Raises OSError."""
         section = config.record
         if section.folder is None:
             return None
-        return Recorder(config.path(section.folder), section.file_mb, section.total_mb)
+        beside, now_ns = list(recorded.files(config)), self.clock.now_ns()
+        recorder = Recorder(config.path(section.folder), section.file_mb, section.total_mb)
+        for name, content in beside:
+            recorder.add(name, now_ns, content)
+        return recorder
 
     def _record_with(self, recorder: Recorder | None) -> None:
         """Record with another recorder from now on, or not at all. Not while the estimator may be adding to the last one."""

@@ -98,13 +98,14 @@ def test_killed_and_started_again(tmp_path: Path, bus: can.BusABC) -> None:
         stand(run, port, bus, lambda: sum(m.mode is Mode.NOMINAL for m in run.messages) > 50 and "same place" in note(run))
     state = run.messages[-1].state
     assert state is not None and abs(state.yaw_deg - 30.0) < 2.0
-    box = sorted((tmp_path / "box").iterdir())
-    assert box[0].name.endswith("Z-state.json")
-    again = replayed(hot, box[1:], read_state(box[0]))
+    (state_file,) = (tmp_path / "box").glob("*Z-state.json")
+    box = sorted((tmp_path / "box").glob("*log"))
+    again = replayed(hot, box, read_state(state_file))
     assert len(again) > 50
     assert again == [encode(message, "json") for message in run.messages[: len(again)]]
-    logs, csv = [str(path) for path in box[1:]], tmp_path / "track.csv"
-    assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, "--stored", str(box[0]), "--csv", str(csv)]) == 0
+    logs, csv = [str(path) for path in box], tmp_path / "track.csv"
+    more = ["--stored", str(state_file), "--csv", str(csv)]
+    assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, *more]) == 0
     assert ",nominal\n" in csv.read_text()
     assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, "--csv", str(csv)]) == 0
     assert ",nominal\n" not in csv.read_text()

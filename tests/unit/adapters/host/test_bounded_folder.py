@@ -66,3 +66,15 @@ def test_a_recording_larger_than_the_limit_loses_its_own_beginning_and_says_so(t
     drive = recording(tmp_path)
     made = [name for number in range(8) for name in fill(drive, IN_1971 + number * SECOND, 1)]
     assert names(tmp_path) == made[3:] and drive.removed == 3
+
+
+def test_what_is_kept_goes_last_of_its_recording(tmp_path: Path) -> None:
+    box = BoundedFolder(tmp_path, r"\w+\.(?:log|json)", SIZE, 500, r"\w+\.json")
+    box.new_file(NOW, "config.json").write_bytes(bytes(SIZE))
+    for number in range(1, 13):
+        fill(box, NOW + number * SECOND, 1)
+    assert [name.rpartition("-")[2] for name in names(tmp_path)] == ["config.json", *["can.log"] * 4]
+    later = BoundedFolder(tmp_path, r"\w+\.(?:log|json)", SIZE, 500, r"\w+\.json")
+    for number in range(60, 65):
+        fill(later, NOW + number * SECOND, 1)
+    assert [name[:4] for name in names(tmp_path)] == ["0002"] * 5  # of an older recording nothing is held back

@@ -150,7 +150,7 @@ def test_replay_of_the_recording_measures_the_same_round_trips(tmp_path: Path, m
     published: list[bytes] = []
     task = ReplayTask(settings.publish.rate_hz, on_tick=[lambda message, _: published.append(encode(message, "json"))])
     replay = Replay(settings, task)
-    replay.run(open_logs([str(path) for path in (tmp_path / "box").iterdir()], settings))
+    replay.run(open_logs([str(path) for path in (tmp_path / "box").glob("*log")], settings))
     assert replay.engine.fusion.clock.report() == run.daemon.live.engine.fusion.clock.report()
     assert len(published) > 20
     assert [encode(message, "json") for message in run.messages][: len(published)] == published
