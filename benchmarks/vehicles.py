@@ -1,10 +1,12 @@
 """Many vehicles through one Zenoh router: what arrives, what is lost, and how late.
 
-    python -m benchmarks.vehicles [--vehicles 20] [--rate 100] [--seconds 20] [--processes 4]
+    python -m benchmarks.vehicles [--vehicles 20] [--rate 100] [--seconds 20] [--processes 4] [--light]
+    python -m benchmarks.vehicles --table [--seconds 10]
 
 Each vehicle has its own session and publisher, as in the daemon. It publishes states at the rate, and each second a health
 message and an event, which Zenoh delivers reliably. The router, the vehicles (several per process) and the reader run in
-separate processes.
+separate processes. `--light` publishes states that are encoded before, and does not decode them: vehicles and reader then
+leave the machine to the router. `--table` measures 20, 100 and 200 vehicles at 10, 50 and 100 Hz so, a row each.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import socket
 import statistics
 import subprocess
@@ -20,12 +23,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import NamedTuple
 
 import numpy as np
+import zenoh
 
 from fusiond.app.client import Client
 from fusiond.config.outputs import Zenoh
 from fusiond.estimator.solution import Mode, Solution, SolutionState
+from fusiond.messages.codec import encode
 from fusiond.messages.from_solution import state_message
 from fusiond.messages.types import (
     EventMessage,
@@ -37,7 +43,7 @@ from fusiond.messages.types import (
     SourceHealth,
     StateMessage,
 )
-from fusiond_adapters.zenoh.session import KIND, ZenohPublisher, open_session
+from fusiond_adapters.zenoh.session import KIND, ZenohPublisher, open_session, session_config, state_key
 
 GRACE_S = 3.0  # after the last publication, for messages that are fetched again
 COUNTS = OutcomeCounts(fused=48_211, rejected=37)
@@ -68,23 +74,36 @@ def health(vehicle: str, t_ns: int) -> HealthMessage:
 
 
 def route(port: int) -> None:
-    with open_session(Zenoh(mode="router", listen=[f"tcp/127.0.0.1:{port}"])):
+    config = session_config(Zenoh(mode="router", listen=[f"tcp/127.0.0.1:{port}"]))
+    config.insert_json5("transport/unicast/max_sessions", "10000")  # as configs/zenoh/yard.json5 has it
+    with zenoh.open(config):
         print("ready", flush=True)
         sys.stdin.read()
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        print(json.dumps({"cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss / 1024}), flush=True)
 
 
-def publish(port: int, names: list[str], rate: float, seconds: float) -> None:
+def stamped(t_ns: int, rest: bytes) -> bytes:
+    """A state of which only the stamp is new."""
+    return t_ns.to_bytes(8, "big") + rest
+
+
+def publish(port: int, names: list[str], rate: float, seconds: float, light: bool) -> None:
     """Publish for several vehicles, in turn within each period. Prints the number of messages of each kind per vehicle."""
     section = Zenoh(mode="client", listen=[], connect=[f"tcp/127.0.0.1:{port}"])
     with ExitStack() as stack:
         vehicles = [
             stack.enter_context(ZenohPublisher(stack.enter_context(open_session(section)), name, "json")) for name in names
         ]
+        rest = encode(state("vehicle000", time.time_ns()), "json")[8:]
         begin, periods = time.monotonic(), round(rate * seconds)
         for number in range(periods):
             time.sleep(max(0.0, begin + number / rate - time.monotonic()))
             for vehicle in vehicles:
-                vehicle.publish(state(vehicle.vehicle, time.time_ns()))
+                if light:
+                    vehicle._publishers[state_key(vehicle.vehicle)].put(stamped(time.time_ns(), rest))
+                else:
+                    vehicle.publish(state(vehicle.vehicle, time.time_ns()))
                 if number % round(rate) == 0:
                     vehicle.publish(health(vehicle.vehicle, time.time_ns()))
                     vehicle.publish(EventMessage(vehicle=vehicle.vehicle, t_ns=time.time_ns(), kind="mode",
@@ -94,7 +113,7 @@ def publish(port: int, names: list[str], rate: float, seconds: float) -> None:
         sys.stdin.read()
 
 
-def read(port: int) -> None:
+def read(port: int, light: bool) -> None:
     """Count what arrives, each message once, until standard input ends; then print the counts."""
     seen: dict[type[Message], set[tuple[str, int]]] = {kind: set() for kind in KINDS}
     doubles: Counter[str] = Counter()
@@ -111,8 +130,17 @@ def read(port: int) -> None:
 
         return keep
 
+    def keep_light(sample: zenoh.Sample) -> None:
+        t_ns = int.from_bytes(sample.payload.to_bytes()[:8], "big")
+        late_ms.append((time.time_ns() - t_ns) / 1e6)
+        identity = str(sample.key_expr), t_ns
+        doubles["state"] += identity in seen[StateMessage]
+        seen[StateMessage].add(identity)
+
     with Client(f"tcp/127.0.0.1:{port}", "*") as client, ExitStack() as stack:
-        for kind in KINDS:
+        if light:
+            stack.enter_context(client._session.declare_subscriber(state_key("*"), keep_light))
+        for kind in KINDS[1:] if light else KINDS:
             stack.enter_context(client.subscribed(kind, keeper(kind)))
         print("ready", flush=True)
         sys.stdin.read()
@@ -146,18 +174,35 @@ def end(made: subprocess.Popen[str]) -> None:
     made.stdin.close()
 
 
-def measure(vehicles: int, rate: float, seconds: float, processes: int) -> str:
+class Measured(NamedTuple):
+    """What one run gave."""
+
+    vehicles: int
+    achieved_hz: float
+    seconds: float
+    counts: dict[str, tuple[int, int, int]]  # by kind: published, arrived, doubled
+    late_ms: dict[str, float]
+    router_cpu: float  # processors
+    router_mb: float
+
+    def lost(self, kind: str) -> int:
+        published, arrived, _ = self.counts[kind]
+        return published - arrived
+
+
+def measure(vehicles: int, rate: float, seconds: float, processes: int, light: bool) -> Measured:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    names = [f"vehicle{number:02d}" for number in range(vehicles)]
+    names = [f"vehicle{number:03d}" for number in range(vehicles)]
+    mode = ["--light"] if light else []
     with ExitStack() as stack:
         router = stack.enter_context(process("route", port))
         line(router)
-        reader = stack.enter_context(process("read", port))
+        reader = stack.enter_context(process("read", port, *mode))
         line(reader)
         shares = [names[i::processes] for i in range(processes)]
-        numbers = ("--rate", rate, "--seconds", seconds)
+        numbers = ("--rate", rate, "--seconds", seconds, *mode)
         publishers = [stack.enter_context(process("publish", port, *share, *numbers)) for share in shares]
         done = [json.loads(line(made)) for made in publishers]
         time.sleep(GRACE_S)
@@ -165,17 +210,44 @@ def measure(vehicles: int, rate: float, seconds: float, processes: int) -> str:
         found = json.loads(line(reader))
         for made in (*publishers, router):
             end(made)
+        used = json.loads(line(router))
     periods = sum(one["periods"] * len(share) for one, share in zip(done, shares, strict=True))
     reliable = sum(one["reliable"] * len(share) for one, share in zip(done, shares, strict=True))
     achieved = periods / vehicles / max(one["seconds"] for one in done)
+    counts = {
+        kind: (sent, found["counts"][kind], found["doubles"].get(kind, 0))
+        for kind, sent in (("state", periods), ("health", reliable), ("events", reliable))
+    }
+    took = max(one["seconds"] for one in done)
+    assert found["vehicles"] == vehicles, f"{found['vehicles']} of {vehicles} vehicles were heard"
+    return Measured(vehicles, achieved, took, counts, found["late_ms"], used["cpu_s"] / took, used["peak_mb"])
+
+
+def text(found: Measured) -> str:
     rows = [("", "published", "arrived", "lost", "doubled")]
-    for kind, sent in (("state", periods), ("health", reliable), ("events", reliable)):
-        got = found["counts"][kind]
-        rows.append((kind, str(sent), str(got), str(sent - got), str(found["doubles"].get(kind, 0))))
-    late = ", ".join(f"{name} {ms:.2f}" for name, ms in found["late_ms"].items())
-    head = f"{found['vehicles']} vehicles at {achieved:.1f} Hz for {seconds:g} s through one router, {os.cpu_count()} CPUs"
+    for kind, (sent, got, doubled) in found.counts.items():
+        rows.append((kind, *map(str, (sent, got, sent - got, doubled))))
+    late = ", ".join(f"{name} {ms:.2f}" for name, ms in found.late_ms.items())
+    head = (
+        f"{found.vehicles} vehicles at {found.achieved_hz:.1f} Hz for {found.seconds:.0f} s through one router,"
+        f" {os.cpu_count()} CPUs"
+    )
     table = "\n".join(f"{row[0]:8}" + "".join(f"{cell:>12}" for cell in row[1:]) for row in rows)
-    return f"{head}\n{table}\nstates were late by [ms]: {late}"
+    router = f"the router took {100 * found.router_cpu:.0f} % of a CPU and {found.router_mb:.0f} MB"
+    return f"{head}\n{table}\nstates were late by [ms]: {late}\n{router}"
+
+
+HEADS = "| vehicles | Hz wanted | Hz | states | lost | reliable | lost | p50 ms | p99 ms | router CPU % | MB |"
+
+
+def row(found: Measured, wanted_hz: float) -> str:
+    reliable = found.counts["health"][0] + found.counts["events"][0]
+    cells = (
+        found.vehicles, f"{wanted_hz:g}", f"{found.achieved_hz:.1f}", found.counts["state"][0], found.lost("state"),
+        reliable, found.lost("health") + found.lost("events"), f"{found.late_ms['p50']:.2f}", f"{found.late_ms['p99']:.1f}",
+        f"{100 * found.router_cpu:.0f}", f"{found.router_mb:.0f}",
+    )  # fmt: skip
+    return f"| {' | '.join(map(str, cells))} |"
 
 
 def main(arguments: list[str]) -> None:
@@ -186,17 +258,25 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--rate", type=float, default=100.0)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--processes", type=int, default=4)
+    parser.add_argument("--light", action="store_true")
+    parser.add_argument("--table", action="store_true")
     options = parser.parse_args(arguments)
+    if options.table:
+        print(f"{HEADS}\n|{'---|' * HEADS.count(' | ')}---|")
+        for vehicles in (20, 100, 200):
+            for rate in (10.0, 50.0, 100.0):
+                print(row(measure(vehicles, rate, options.seconds, options.processes, True), rate), flush=True)
+        return
     if options.role == "measure":
-        print(measure(options.vehicles, options.rate, options.seconds, options.processes))
+        print(text(measure(options.vehicles, options.rate, options.seconds, options.processes, options.light)))
         return
     port, *names = options.rest
     if options.role == "route":
         route(int(port))
     elif options.role == "read":
-        read(int(port))
+        read(int(port), options.light)
     else:
-        publish(int(port), names, options.rate, options.seconds)
+        publish(int(port), names, options.rate, options.seconds, options.light)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@ gate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from threading import Event
 
 from fusiond.config.schema import Config
@@ -21,6 +22,25 @@ except ModuleNotFoundError as missing:
     raise ConfigError("[foxglove] needs the extra foxglove: pip install 'fusiond[foxglove]'") from missing
 
 MAX_WAITING = 1024  # messages between the estimator and the server, and between the server and each client
+
+
+@contextmanager
+def served(name: str, host: str, port: int, origins: Sequence[str]) -> Iterator[tuple[Context, Gate]]:
+    """Inside the block, the topics of a context are served to those that a gate lets in. Raises OSError, RuntimeError."""
+    context, inside = Context(), hidden_host()
+    server = start_server(name=name, host=inside, port=0, context=context, message_backlog_size=MAX_WAITING)
+    with ExitStack() as stack:
+        stack.callback(server.stop)
+        gate = Gate(host, port, (inside, server.port), origins)
+        gate.start()
+        stack.callback(gate.stop)
+        yield context, gate
+
+
+def topic(context: Context, name: str, schema: str, layout: bytes) -> Channel:
+    """A topic of JSON messages, by the name of their schema and the JSON Schema itself."""
+    described = Schema(name=schema, encoding="jsonschema", data=layout)
+    return Channel(name, schema=described, message_encoding="json", context=context)
 
 
 class FoxgloveServer:
@@ -41,33 +61,23 @@ class FoxgloveServer:
 
     def session(self, stop: Event) -> None:
         """Serve until `stop` is set. Raises OutputLost."""
-        section, context, inside = self._config.foxglove, Context(), hidden_host()
-        try:
-            server = start_server(
-                name=f"fusiond {self._config.vehicle.name}",
-                host=inside,
-                port=0,
-                context=context,
-                message_backlog_size=MAX_WAITING,
-            )
-        except RuntimeError as error:  # the SDK raises no other
-            raise OutputLost(f"{self.about}: {error}") from error
-        try:
-            gate = Gate(section.host, section.port, (inside, server.port), section.origins)
-            gate.start()
-        except (OSError, RuntimeError) as error:
-            server.stop()
-            raise OutputLost(f"{self.about}: {getattr(error, 'strerror', None) or error}") from error
-        self._gate = gate
-        try:
+        section = self._config.foxglove
+        with ExitStack() as stack:
+            try:
+                context, gate = stack.enter_context(
+                    served(f"fusiond {self._config.vehicle.name}", section.host, section.port, section.origins)
+                )
+            except (OSError, RuntimeError) as error:
+                raise OutputLost(f"{self.about}: {getattr(error, 'strerror', None) or error}") from error
+            self._gate = gate
+            stack.callback(self._ended)
             host = f"[{section.host}]" if ":" in section.host else section.host
             self.url = f"ws://{host}:{gate.port}"
             self._serve(context, gate, stop)
-        finally:
-            self.url = None
-            gate.stop()
-            server.stop()
-            self._clients, self._gate = self._client_counts(), None
+
+    def _ended(self) -> None:
+        self.url = None
+        self._clients, self._gate = self._client_counts(), None
 
     def counts(self) -> dict[str, int]:
         """Records sent, records of unknown topics, and clients by what became of them."""
@@ -83,12 +93,7 @@ class FoxgloveServer:
 
     def _serve(self, context: Context, gate: Gate, stop: Event) -> None:
         topics = {
-            channel.topic: Channel(
-                channel.topic,
-                schema=Schema(name=channel.schema_name, encoding="jsonschema", data=channel.schema),
-                message_encoding="json",
-                context=context,
-            )
+            channel.topic: topic(context, channel.topic, channel.schema_name, channel.schema)
             for channel in channels(self._config)
         }
         stopping = False
@@ -97,11 +102,11 @@ class FoxgloveServer:
             gate.check()
             for message in self.outbox.take(POLL_S):
                 for record in self._converter.records(message):
-                    topic = topics.get(record.topic)
-                    if topic is None:
+                    channel = topics.get(record.topic)
+                    if channel is None:
                         self.unknown += 1
                         continue
-                    topic.log(record.data, log_time=record.publish_ns)
+                    channel.log(record.data, log_time=record.publish_ns)
                     self.sent += 1
         for one in topics.values():
             one.close()

@@ -75,14 +75,19 @@ class Client:
         For health, events, info and config the latest message comes at once, and missed ones are fetched again. A state,
         settled state or innovation that is lost on a slow network is not.
         """
-        name = KIND[kind]
-        where = key(self.vehicle, name, "*" if kind is InnovationMessage else "")
 
         def receive(sample: zenoh.Sample) -> None:
             message = self._decoded(sample, kind)
             if message is not None:
                 callback(message)
 
+        with self._subscriber(kind, receive):
+            yield
+
+    def _subscriber(self, kind: type[AnyMessage], receive: Callable[[zenoh.Sample], None]) -> Any:
+        """A context manager. Of what is kept for late readers, the latest comes at once, and missed ones are fetched."""
+        name = KIND[kind]
+        where = key(self.vehicle, name, "*" if kind is InnovationMessage else "")
         subscriber: Any
         if name in STREAMS:
             subscriber = self._session.declare_subscriber(where, receive)
@@ -94,6 +99,29 @@ class Client:
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
                 recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
             )
+        return subscriber
+
+    @contextmanager
+    def heard(
+        self, kind: type[AnyMessage], callback: Callable[[str, Callable[[], AnyMessage | None]], None]
+    ) -> Iterator[None]:
+        """Inside the block, `callback` gets the vehicle and a function that decodes its message, for every message of a kind
+        of many vehicles: to decode all of them may be too much. The function returns None for what cannot be decoded."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            callback(str(sample.key_expr).split("/")[1], lambda: self._decoded(sample, kind))
+
+        with self._subscriber(kind, receive):
+            yield
+
+    @contextmanager
+    def presence(self, callback: Callable[[str, bool], None]) -> Iterator[None]:
+        """Inside the block, `callback` gets each vehicle that is there or comes, with True, and each that goes, False."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            callback(str(sample.key_expr).split("/")[1], sample.kind == zenoh.SampleKind.PUT)
+
+        subscriber: Any = self._session.liveliness().declare_subscriber(alive_key(self.vehicle), receive, history=True)
         with subscriber:
             yield
 

@@ -82,7 +82,7 @@ def lost_imu(drive: Path) -> None:
         file.truncate(2000)
 
 
-def endless(drive: Path, gigabytes: int = 20) -> None:
+def endless(drive: Path, gigabytes: int = 10) -> None:
     """A packed log that is small on the disk, and hours of work: a preallocated file that was packed as a whole."""
     block = gzip.compress(BLOCK * 64)
     with (drive / "drive.tlog.gz").open("wb") as file:
@@ -91,6 +91,6 @@ def endless(drive: Path, gigabytes: int = 20) -> None:
     (drive / "drive.tlog").unlink()
 
 
-def hungry(drive: Path, megabytes: int = 1000) -> None:
+def hungry(drive: Path, megabytes: int = 300) -> None:
     """A DBC file that was preallocated, and never written: it is read as a whole."""
     os.truncate(drive / "wheels.dbc", megabytes << 20)

@@ -17,6 +17,7 @@ COMMANDS = {
     "report": "fuse recorded logs, and write one HTML file that shows the drive and what became of its data",
     "batch": "replay many drives, and tell whether a configuration is better on them",
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
+    "fleet": "show many running vehicles at once, and their alarms",
     "check": "explain what a configuration does, or what is wrong with it",
     "mount": "estimate the mounting angles of the IMU from logs",
     "simulate": "write the logs of a simulated drive and its truth",

@@ -102,16 +102,27 @@ def once(watch: Watch, out: TextIO) -> None:
 
 def live(watch: Watch, keys: TextIO, out: TextIO, codes: Mapping[Colour, str] = CODES) -> None:
     """Redraw until `q` is pressed; other keys choose what is shown."""
+
+    def drawn(place: Place, width: int, height: int) -> list[Line]:
+        watch.update(0)
+        return page(watch.view, watch.silent_s, width, height, place)
+
+    redraw(drawn, keys, out, codes)
+
+
+def redraw(
+    drawn: Callable[[Place, int, int], list[Line]], keys: TextIO, out: TextIO, codes: Mapping[Colour, str] = CODES
+) -> None:
+    """Draw a screen, for a place, width and height, until `q` is pressed; other keys move the place."""
     place, pressed = Place(), list[str]()
     with _raw(keys), _screen(out):
         while not QUIT.intersection(pressed):
             width, height = shutil.get_terminal_size()
             for key in pressed:
                 place.press(KEYS.get(key, key), max(1, height - 3))
-            lines = page(watch.view, watch.silent_s, width, height, place)
+            lines = drawn(place, width, height)
             out.write(HOME + "\n".join(ansi(line, codes) + REST_OF_LINE for line in lines) + REST_OF_SCREEN)
             out.flush()
-            watch.update(0)
             select.select([keys], [], [], REDRAW_S)
             pressed = _pressed(keys)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
@@ -108,19 +108,25 @@ class Place:
 def screen(view: View, silent_s: float, width: int, part: str = PARTS[0]) -> list[Line]:
     """All lines of a part; `silent_s` is the time since the last state. A text that is too long for the width goes on
     below, but numbers do not."""
-    return [_printable(line) for line in (_title(view, silent_s), *_lines(view, width, part))]
+    return [printable(line) for line in (_title(view, silent_s), *_lines(view, width, part))]
 
 
 def page(view: View, silent_s: float, width: int, height: int, place: Place) -> list[Line]:
     """What a terminal of this size shows: the first line, what fits of the others, and the keys. `place` is kept inside."""
     title, *lines = screen(view, silent_s, width, PARTS[place.part])
+    return scrolled(title, lines, width, height, place, lambda room: _keys(place, len(lines), room))
+
+
+def scrolled(
+    title: Line, lines: Sequence[Line], width: int, height: int, place: Place, keys: Callable[[int], Line]
+) -> list[Line]:
+    """A title, what fits of the lines, and below them what `keys` says of so many shown. `place` is kept inside."""
     room = max(0, height - 2)
     place.top = min(place.top, max(0, len(lines) - room))
-    place.left = min(place.left, max(0, max(map(_length, lines), default=0) - width))
-    shown = [_from_column(line, place.left) for line in lines[place.top : place.top + room]]
+    place.left = min(place.left, max(0, max(map(length, lines), default=0) - width))
+    shown = [from_column(line, place.left) for line in lines[place.top : place.top + room]]
     shown += [()] * (room - len(shown))
-    below = _keys(place, len(lines), room)
-    return [_cut(line, width) for line in (title, *shown, below)[: max(1, height)]]
+    return [cut(line, width) for line in (title, *shown, keys(room))[: max(1, height)]]
 
 
 def _keys(place: Place, lines: int, room: int) -> Line:
@@ -137,26 +143,29 @@ def plain(line: Line) -> str:
     return "".join(span.text for span in line).rstrip()
 
 
-def _length(line: Line) -> int:
+def length(line: Line) -> int:
+    """Characters of a line."""
     return sum(len(span.text) for span in line)
 
 
-def _printable(line: Line) -> Line:
+def printable(line: Line) -> Line:
     """A line without control characters: no text of a message may control the terminal."""
     return tuple(
         Span("".join(letter if letter.isprintable() else "?" for letter in span.text), span.colour) for span in line
     )
 
 
-def _cut(line: Line, width: int) -> Line:
-    cut = []
+def cut(line: Line, width: int) -> Line:
+    """The first so many columns of a line."""
+    kept = []
     for span in line:
-        cut.append(Span(span.text[: max(0, width)], span.colour))
+        kept.append(Span(span.text[: max(0, width)], span.colour))
         width -= len(span.text)
-    return tuple(span for span in cut if span.text)
+    return tuple(span for span in kept if span.text)
 
 
-def _from_column(line: Line, column: int) -> Line:
+def from_column(line: Line, column: int) -> Line:
+    """A line without its first so many columns."""
     rest = []
     for span in line:
         rest.append(Span(span.text[max(0, column) :], span.colour))
@@ -207,11 +216,11 @@ def _events(events: Iterable[EventMessage], width: int) -> Iterator[Line]:
 
 def _folded(line: Line, text: Span, width: int) -> Iterator[Line]:
     """A line that ends with a text; where the text does not fit, it goes on below."""
-    if _length(line) + len(text.text.rstrip()) <= width:
+    if length(line) + len(text.text.rstrip()) <= width:
         yield (*line, text)
         return
     room = max(LEAST_TEXT, width - INDENT)
-    first, *rest = wrap(text.text, max(1, width - _length(line))) if width - _length(line) >= LEAST_TEXT else ["", text.text]
+    first, *rest = wrap(text.text, max(1, width - length(line))) if width - length(line) >= LEAST_TEXT else ["", text.text]
     yield (*line, Span(first, text.colour))
     yield from ((Span(" " * INDENT), Span(row, text.colour)) for row in wrap(" ".join(rest), room))
 
@@ -242,7 +251,7 @@ def _state(message: StateMessage) -> Iterator[Line]:
 
 def _motion(state: State) -> Iterator[Line]:
     north, east, down = state.velocity_ned_mps
-    latitude, longitude = _compass(state.lat_deg, "NS"), _compass(state.lon_deg, "EW")
+    latitude, longitude = compass(state.lat_deg, "NS"), compass(state.lon_deg, "EW")
     sigma_n, sigma_e, sigma_d = state.sigma_position_ned_m
     yield _pair("position", f"{latitude}  {longitude}  {state.height_m:.2f} m")
     yield _pair("  sigma", f"north {sigma_n:.2f}  east {sigma_e:.2f}  down {sigma_d:.2f} m")
@@ -260,7 +269,8 @@ def _pair(name: str, text: str) -> Line:
     return Span(f"{name:10}", "dim"), Span(text)
 
 
-def _compass(degrees: float, letters: str) -> str:
+def compass(degrees: float, letters: str) -> str:
+    """A latitude or longitude with one of two letters for its sign."""
     return f"{abs(degrees):.7f} {letters[degrees < 0]}"
 
 
@@ -285,7 +295,7 @@ def _running(health: HealthMessage) -> Iterator[Line]:
 def _sources(health: HealthMessage, before: HealthMessage | None, width: int) -> Iterator[Line]:
     old = before.sources if before else {}
     rows = [_source(name, source, old.get(name)) for name, source in health.sources.items()]
-    yield from _table(("SOURCE", "rate Hz", "age ms", *OUTCOMES.values(), "ratio", "NIS", "jitter ms", ""), rows, width)
+    yield from table(("SOURCE", "rate Hz", "age ms", *OUTCOMES.values(), "ratio", "NIS", "jitter ms", ""), rows, width)
 
 
 def _inputs(health: HealthMessage, width: int) -> Iterator[Line]:
@@ -299,13 +309,13 @@ def _inputs(health: HealthMessage, width: int) -> Iterator[Line]:
             )
             for name, one in health.inputs.items()
         ]
-        yield from _table(("INPUT", "received", "dropped", ""), rows, width)
+        yield from table(("INPUT", "received", "dropped", ""), rows, width)
 
 
 def _outputs(health: HealthMessage, width: int) -> Iterator[Line]:
     if health.outputs:
         rows = [_output(name, one) for name, one in health.outputs.items()]
-        yield from _table(("OUTPUT", "offered", "dropped", "p50 p99 max ms", ""), rows, width)
+        yield from table(("OUTPUT", "offered", "dropped", "p50 p99 max ms", ""), rows, width)
 
 
 def _source(name: str, source: SourceHealth, before: SourceHealth | None) -> Sequence[Span]:
@@ -362,7 +372,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}"
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[Span]], width: int) -> Iterator[Line]:
+def table(heads: Sequence[str], rows: Iterable[Sequence[Span]], width: int) -> Iterator[Line]:
     """Columns of minimum width: the first aligned left, numbers right; the last is text, which may go on below."""
     rows, last = list(rows), len(heads) - 1
     widths = [max(map(len, (head, *(row[i].text for row in rows)))) for i, head in enumerate(heads)]

@@ -15,7 +15,7 @@ from fusiond.app.batch.job import Answer, Job, Limits, Options
 from fusiond.app.batch.keeper import ATTEMPTS, Keeper, _judged
 from tests.helpers import fleet
 
-LIMITS = Limits(seconds=2.0, memory_mb=600.0)
+LIMITS = Limits(seconds=1.0, memory_mb=300.0)
 
 
 def job(drive: Path, limits: Limits = LIMITS) -> Job:
@@ -57,9 +57,9 @@ def test_a_bad_drive_costs_only_itself(tmp_path: Path) -> None:
     with Keeper() as keeper:
         answers = [keeper.run(job(drive)) for drive in (slow, hungry, good)]
         assert [answer.status for answer in answers] == ["timed out", "out of memory", "ok"]
-        assert [answer.reason for answer in answers] == ["more than 2 s of processor time", "more than 600 MB", ""]
+        assert [answer.reason for answer in answers] == ["more than 1 s of processor time", "more than 300 MB", ""]
         assert answers[2].row is not None and answers[2].row.status == "ok"
-        assert 1.5 < answers[0].cpu_s < 4.0 and 50 < answers[2].peak_mb < 600
+        assert 0.9 < answers[0].cpu_s < 3.0 and 50 < answers[2].peak_mb < 300
         assert keeper.pid is not None and child_of(keeper.pid) is None
 
 
@@ -110,11 +110,11 @@ def _runs(pid: int) -> bool:
 @pytest.mark.parametrize(
     ("code", "over", "status", "reason"),
     [
-        (-signal.SIGPROF, False, "timed out", "more than 2 s of processor time"),
+        (-signal.SIGPROF, False, "timed out", "more than 1 s of processor time"),
         (-signal.SIGSEGV, False, "crashed", "its process was killed by SIGSEGV"),
         (70, False, "crashed", "its process ended with status 70"),
         (0, False, "crashed", "its process ended with status 0"),  # and told nothing
-        (-signal.SIGKILL, True, "timed out", "not ended after 20 s, mostly waiting"),
+        (-signal.SIGKILL, True, "timed out", "not ended after 10 s, mostly waiting"),
     ],
 )
 def test_how_a_child_ended_is_told(code: int, over: bool, status: str, reason: str) -> None:

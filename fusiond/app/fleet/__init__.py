@@ -1,0 +1,1 @@
+"""Many running vehicles at once: what each does, and alarms."""
