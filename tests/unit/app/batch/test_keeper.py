@@ -59,7 +59,7 @@ def test_a_bad_drive_costs_only_itself(tmp_path: Path) -> None:
         assert [answer.status for answer in answers] == ["timed out", "out of memory", "ok"]
         assert [answer.reason for answer in answers] == ["more than 1 s of processor time", "more than 300 MB", ""]
         assert answers[2].row is not None and answers[2].row.status == "ok"
-        assert 0.9 < answers[0].cpu_s < 3.0 and 50 < answers[2].peak_mb < 300
+        assert 0.5 < answers[0].cpu_s < 3.0 and 50 < answers[2].peak_mb < 300
         assert keeper.pid is not None and child_of(keeper.pid) is None
 
 
