@@ -24,11 +24,9 @@ def load(file: str | Path) -> Config:
 
 def parse(text: str, path: Path = Path("config.toml")) -> Config:
     """Check the text of a configuration file; `path` serves for messages and relative names. Raises ConfigError."""
-    config = decode(text, path, Config, directory=str(path.parent))
-    refuse(contradictions(config), text, path)
     kept = path.suffix == ".json"
     config = recorded.parse(text, path) if kept else decode(text, path, Config, directory=str(path.parent))
-    refuse(_contradictions(config), text, path)
+    refuse(contradictions(config), text, path)
     return config
 
 
