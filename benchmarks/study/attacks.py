@@ -36,6 +36,7 @@ from benchmarks.study.tampering import (
     Tamper,
     adds,
     clipped,
+    forged_wheels,
     frozen,
     inertial,
     jump,
@@ -147,6 +148,7 @@ def _attacks() -> dict[str, Attack]:
     found["all wheels locked for 2 s, in 60 s without GNSS"] = Attack(
         together(dead, later(20.0, wheels(0.0, 2.0))), MINUTE, ALL, reference=DEAF
     )
+    found["forged wheel frames for 8 s"] = Attack(forged_wheels(25.0, 8.0, 70.0), 8.0, ALL, 5.0, 3.0)
     found["IMU silent for 1.6 s in 60 s without GNSS"] = Attack(
         together(dead, later(20.0, silent(ImuSample, 1.6))), MINUTE, IMU, reference=DEAF
     )

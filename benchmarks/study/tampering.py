@@ -225,3 +225,21 @@ def wheels(factor: float, seconds: float = math.inf, which: Sequence[str] = ()) 
         return event
 
     return edited(lambda _: edit, seconds)
+
+
+def forged_wheels(rate_hz: float, seconds: float, fastest: float) -> Tamper:
+    """Frames that say anything up to a speed [m/s], for all wheels, come as well at random instants."""
+
+    def tamper(events: Sequence[Received], begin_ns: int, random: Random) -> list[Received]:
+        last = {event.source: event for event in events if isinstance(event.payload, WheelSpeed)}
+        sequence = {source: event.sequence for source, event in last.items()}
+        found = list(events)
+        for since in np.sort(random.uniform(0.0, seconds, round(rate_hz * seconds))):
+            t_ns = begin_ns + nanoseconds(float(since))
+            for source, event in last.items():
+                sequence[source] += 1
+                speed = WheelSpeed(float(random.uniform(-fastest, fastest)))
+                found.append(replace(event, sequence=sequence[source], t_receive_ns=t_ns, payload=speed))
+        return sorted(found, key=lambda event: event.t_receive_ns)
+
+    return tamper

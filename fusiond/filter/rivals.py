@@ -186,8 +186,8 @@ def fit_lie(  # noqa: PLR0912 - loops
 ) -> float:
     """Let the rival in which the inertial sensor lied take the lie that explains an observation best, delta = Lambda H'
     (S + H Lambda H')^-1 d, as an uncertainty of that size, if that makes it likelier and the lie is fresh. `across` and
-    `spread`, H P and H P H', become those of P + delta delta'. Returns how likely
-    that is beforehand."""
+    `spread`, H P and H P H', become those of P + delta delta'. Returns how likely that is beforehand, the less the larger
+    it is: exp(-delta' Lambda^-1 delta / 2)."""
     m, widened, lower, lie, off = seen.m, np.empty((3, 3)), np.empty((3, 3)), np.zeros(rival.size), np.zeros(3)
     with_lie(seen, spread, LARGEST, widened)
     solved = np.empty(3)
@@ -207,10 +207,13 @@ def fit_lie(  # noqa: PLR0912 - loops
             lie[k] += LARGEST * lie_variance(k) * seen.jacobian[a, k] * solved[a]
         for a in range(m):
             off[a] += seen.jacobian[a, k] * lie[k]
+    size = 0.0
     for a in range(m):
+        size += off[a] * solved[a]
         for b in range(m):
             widened[a, b] = spread[a, b] + off[a] * off[b]
-    larger = LARGER * likelihood(seen.innovation, seen.variance, 1.0, m, widened)
+    prior = LARGER * exp(-min(size, MAX_SQUARE) / 2)
+    larger = prior * likelihood(seen.innovation, seen.variance, 1.0, m, widened)
     if not larger > likelihood(seen.innovation, seen.variance, 1.0, m, spread):
         return 1.0
     for k in range(VELOCITY.start, ACCEL_BIAS.stop):
@@ -219,7 +222,7 @@ def fit_lie(  # noqa: PLR0912 - loops
         rival.covariance[k, k] = max(rival.covariance[k, k], GOES_ON * lie_variance(k))
     mirror(rival.covariance)
     project(rival, seen, across, spread)
-    return LARGER
+    return prior
 
 
 @compiled

@@ -22,6 +22,7 @@ RUNS = {  # of the study, with seed 1
     "spoof, velocity too, 0.5 m/s": 1,
     "spoof, step of 3 m, then 0.3 m/s, velocity too": 1,
     "jump of 100 m held for 180 s": 0,
+    "forged wheel frames for 8 s": 2,
 }
 
 

@@ -2812,6 +2812,8 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
     cdef int64_t a
     cdef int64_t b
     cdef int64_t k
+    cdef double size
+    cdef double prior
     cdef double larger
     cdef double _t1
     cdef double _t2
@@ -2835,10 +2837,13 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
             lie[k] += (((100.0 * rivals_lie_variance(k)) * seen.jacobian[(a) * n + k]) * solved[a])
         for a in range(m):
             off[a] += (seen.jacobian[(a) * n + k] * lie[k])
+    size = 0.0
     for a in range(m):
+        size += (off[a] * solved[a])
         for b in range(m):
             widened[(a) * 3 + b] = (spread[(a) * 3 + b] + (off[a] * off[b]))
-    larger = (0.3 * rivals_likelihood(seen.innovation, seen.variance, 1.0, m, widened))
+    prior = (0.3 * portable_exp(((-(1000.0 if 1000.0 < size else size)) / 2)))
+    larger = (prior * rivals_likelihood(seen.innovation, seen.variance, 1.0, m, widened))
     if (not (larger > rivals_likelihood(seen.innovation, seen.variance, 1.0, m, spread))):
         return 1.0
     for k in range(3, 15):
@@ -2849,7 +2854,7 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
         rival.covariance[(k) * n + k] = (_t2 if _t2 > _t1 else _t1)
     linear_mirror(rival.covariance)
     measurement_update_project(rival, seen, across, spread)
-    return 0.3
+    return prior
 
 cdef bint rivals_speaks(State* state, int64_t wheel) noexcept nogil:
     return (((state.stamps[0] - state.source_stamps[(wheel) * SOURCE_STAMPS_SIZE + 0]) <= 500000000) and source_health_is_trusted(state.memory + (wheel) * MEMORY_SIZE))
