@@ -19,6 +19,7 @@ COMMANDS = {
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
     "fleet": "show many running vehicles at once, and their alarms",
     "check": "explain what a configuration does, or what is wrong with it",
+    "convert": "write public drives of others as logs",
     "mount": "estimate the mounting angles of the IMU from logs",
     "simulate": "write the logs of a simulated drive and its truth",
     "demo": "play a bundled drive to a running fusiond, and explain the result",

@@ -14,6 +14,14 @@ def positive(text: str) -> float:
     return value
 
 
+def seconds(text: str) -> float:
+    """At least 0, and finite."""
+    value = _number(text)
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be at least 0, not {text}")
+    return value
+
+
 def rate(text: str) -> float:
     """A publication rate [Hz]."""
     value = _number(text)
