@@ -1,5 +1,7 @@
-"""Builds the compiled kernel in two widths, if there is a compiler. Everything else is in pyproject.toml."""
+"""Builds the compiled kernel in two widths, if there is a compiler, and gives the package its README. Everything else is in
+pyproject.toml."""
 
+import runpy
 from pathlib import Path
 
 from Cython.Build import cythonize
@@ -22,4 +24,5 @@ modules = cythonize(WIDTHS)
 for module in modules:
     module.optional = True  # without a build the NumPy kernel serves (cythonize drops the flag of the original)
 
-setup(ext_modules=modules)
+readme = runpy.run_path("packaging/readme.py")["long_description"]()
+setup(ext_modules=modules, long_description=readme, long_description_content_type="text/markdown")

@@ -69,3 +69,26 @@ def test_every_library_has_its_licence() -> None:
     for name, *_ in ENTRY.findall((PACKAGING / "requirements.txt").read_text(encoding="utf-8")):
         assert re.search(r"^License: (?!see).+", paragraphs[name], re.MULTILINE), name
     assert "left out of this copy" in paragraphs["pymavlink"]
+
+
+def test_links_and_pictures_work_on_a_package_index() -> None:
+    """All of them lead to the repository; what they name is there."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    repository = project["urls"]["Repository"]
+    page = re.sub(r"^ *```.*?^ *```$", "", printed("readme.py"), flags=re.MULTILINE | re.DOTALL)
+    links = re.findall(r"(!?)\[(?:[^\]\\]|\\.|\](?!\())*\]\(([^)\s]+)\)", page)
+    own = [(picture, target) for picture, target in links if target.startswith(f"{repository}/")]
+    assert len(own) > 50 and all("://" in target for _, target in links)
+    for picture, target in own:
+        kind, branch, file = target.removeprefix(f"{repository}/").split("/", 2)
+        assert (kind, branch) == ("raw" if picture else "blob", "main")
+        assert (ROOT / file.partition("#")[0]).exists(), target
+    assert {picture for picture, _ in own} == {"!", ""}
+
+
+def test_the_project_says_where_it_is_and_which_pythons_it_runs_on() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert {"Homepage", "Repository", "Documentation", "Changelog", "Issues"} == set(project["project"]["urls"])
+    built = {f"{name[2]}.{name[3:5]}" for name in project["tool"]["cibuildwheel"]["build"]}
+    named = {name.rpartition(" :: ")[2] for name in project["project"]["classifiers"] if ":: 3." in name}
+    assert named == built
