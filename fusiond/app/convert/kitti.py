@@ -126,8 +126,8 @@ def _messages(unix_us: NDArray[np.int64], table: Array) -> list[Stamped]:
         if t_us >= due_us:
             due_us += FIX_US * ((t_us - due_us) // FIX_US + 1)
             speed, course = math.hypot(row[NORTH], row[EAST]), math.degrees(math.atan2(row[EAST], row[NORTH]))
-            lat, lon, height, position_m, velocity_mps = row[[LAT, LON, HEIGHT, POSITION_ACCURACY, VELOCITY_ACCURACY]].tolist()
-            fix = Fix(lat, lon, height, speed, course, position_m, velocity_mps)
+            lat, lon, height = row[[LAT, LON, HEIGHT]].tolist()
+            fix = Fix(lat, lon, height, speed, course, float(row[POSITION_ACCURACY]), float(row[VELOCITY_ACCURACY]))
             messages.append((t_us, fix_message(t_us, fix)))
     return messages
 
