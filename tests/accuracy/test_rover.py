@@ -40,17 +40,18 @@ stamp = "boot-arrival"
 transport = { latency_ms = 0.0 }
 """
 DRIVING_S, ALIGNED_S, END_S = 3, 13, 29
-FILTER_DELAY_MS = 56  # of the gyro: sqrt(2) / (2 pi 4 Hz)
+GYRO_DELAY_MS = 56  # of its filter: sqrt(2) / (2 pi 4 Hz)
+GIVEN_DELAY_MS = 11.3  # as configs/ardupilot-rover.toml has it
 
 
 @needs_compiled
 @pytest.mark.parametrize("system_time_off_s", [0.6, -0.6])
 def test_a_stock_rover(tmp_path: Path, system_time_off_s: float) -> None:
     """Loop of 50 Hz, denials, filters with 56 ms of delay, slow round trips, a wrong SYSTEM_TIME: within 10 s of driving the
-    state is nominal and the heading right, and there is no reset."""
+    state is nominal and the heading right, there is no reset, and the delay is learnt."""
     scenario = parse(DRIVE)
     drive, start_ns = simulate(scenario), scenario.start_ns
-    text = configuration(scenario, "wheels.dbc").replace("[imu.imu0]", f"[imu.imu0]\ndelay_ms = {FILTER_DELAY_MS}")
+    text = configuration(scenario, "wheels.dbc").replace("[imu.imu0]", f"[imu.imu0]\ndelay_ms = {GIVEN_DELAY_MS}\ndelay_sigma_ms = 50.0")
     (tmp_path / "wheels.dbc").write_text(dbc(scenario))
     (tmp_path / "rover.toml").write_text(text)
     rover = StockRover(drive, system_time_off_s=system_time_off_s)
@@ -59,7 +60,9 @@ def test_a_stock_rover(tmp_path: Path, system_time_off_s: float) -> None:
 
     published, wanted = rehearsal.published, rehearsal.housekeeping.wanted["HIGHRES_IMU"]
     assert (wanted.measured_hz, wanted.requests, rover.refusals) == (pytest.approx(40, rel=0.05), 16, 15)
-    clock = [message for message in published if isinstance(message, HealthMessage)][-1].sources["imu0"].clock
+    health = [message for message in published if isinstance(message, HealthMessage)][-1]
+    learnt, clock = health.calibration["gyro_delay_ms"], health.sources["imu0"].clock
+    assert GIVEN_DELAY_MS + learnt.value == pytest.approx(GYRO_DELAY_MS, abs=10)
     assert clock is not None
     assert (clock.method, clock.resets, clock.strays) == ("timesync", 0, 0)
     boot_ns = start_ns - round(scenario.autopilot.boot_s * SECOND)
