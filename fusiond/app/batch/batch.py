@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -9,6 +10,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
+
+from msgspec.structs import replace
 
 from fusiond.app.batch import keys
 from fusiond.app.batch.drives import find
@@ -25,7 +28,7 @@ from fusiond.errors import UnusableError, UsageError
 NEW, BASELINE = "new", "baseline"  # roles
 OWN = "own"  # in place of a configuration: the one that lies beside each drive
 DRAWN_S = 0.2  # between two drawings of the progress
-ROWS, SUMMARY, TRACKS = "rows.parquet", "summary.html", "tracks"
+ROWS, SUMMARY, TRACKS, REPORTS = "rows.parquet", "summary.html", "tracks", "reports"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +41,7 @@ class Order:
     baseline: str | None = None  # a configuration, OWN, or the rows of another batch
     options: Options = field(default_factory=Options)
     limits: Limits = field(default_factory=Limits)
+    reports: int = 0  # of the worst drives
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +64,9 @@ def run(order: Order, engine: Engine, progress: TextIO = sys.stderr) -> Result:
             if _of_rows(order.baseline) is None and order.baseline is not None:
                 write_rows(order.folder / f"{BASELINE}.parquet", store.rows(BASELINE))
         findings = gather(store.rows(NEW), _baseline(order, store))
+        links = _report(order, store, engine, findings)
         with delivering(order.folder / SUMMARY):
-            text = page(findings, _title(order), {})
+            text = page(findings, _title(order), links)
             (order.folder / SUMMARY).write_text(text, encoding="utf-8")
         return Result(findings, left, store.cost())
 
@@ -73,14 +78,23 @@ def plan(order: Order, store: Store) -> None:
         roles.append((BASELINE, order.baseline))
     configurations = {config: None if config == OWN else keys.of_configuration(config) for _, config in roles}
     store.begin_plan()
+    smoothed_by = roles[-1][1]  # the baseline if there is one: the reference is the same for both
     for drive in find(order.drives):
+        smooths = order.options.smooth and drive.truth is None
         for role, config in roles:
-            key = keys.of_row(drive, configurations[config], order.options)
-            path = "" if config == OWN else str(Path(config).absolute())
+            key = keys.of_row(drive, configurations[config], order.options, configurations[smoothed_by] if smooths else "")
             track = str((order.folder / TRACKS / f"{key}.parquet").absolute()) if order.options.tracks else ""
-            job = Job(drive=drive, config=path, options=order.options, limits=order.limits, track=track)
+            job = Job(
+                drive=drive, config=_path(config), options=order.options, limits=order.limits, track=track,
+                smoothed_by=_path(smoothed_by) if smooths else None,
+            )  # fmt: skip
             store.plan(role, drive.name, key, job)
     store.end_plan(order.limits)
+
+
+def _path(config: str) -> str:
+    """A configuration as a job has it."""
+    return "" if config == OWN else str(Path(config).absolute())
 
 
 def _of_rows(baseline: str | None) -> Path | None:
@@ -108,6 +122,24 @@ def _measure(store: Store, engine: Engine, left: int, progress: TextIO) -> None:
         for key, answer in engine.answers(pending()):
             store.put(key, _row(jobs.pop(key), answer), answer.cpu_s, answer.peak_mb)
             shown.step()
+
+
+def _report(order: Order, store: Store, engine: Engine, findings: Findings) -> dict[str, str]:
+    """Write the reports of the worst drives; returns where they are, by drive. One that fails has none."""
+    worst = [one.drive for one in findings.worst[: order.reports]]
+    if not worst or importlib.util.find_spec("bokeh") is None:
+        return {}
+    folder = order.folder / REPORTS
+    with delivering(folder):
+        folder.mkdir(exist_ok=True)
+
+    def jobs() -> Iterator[tuple[str, Job]]:
+        for number, drive in enumerate(worst):
+            job = store.job(NEW, drive)
+            yield drive, replace(job, report=str((folder / f"{number:02d}.html").absolute()))
+
+    written = {drive for drive, answer in engine.answers(jobs()) if answer.row is not None and answer.row.status == "ok"}
+    return {drive: f"{REPORTS}/{number:02d}.html" for number, drive in enumerate(worst) if drive in written}
 
 
 def _row(job: Job, answer: Answer) -> Row:

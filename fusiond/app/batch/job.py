@@ -57,13 +57,15 @@ class Options(Struct, frozen=True, kw_only=True):
 
 
 class Job(Struct, frozen=True, kw_only=True):
-    """One drive by one configuration, as it is sent to a worker. `config` is a path; empty: the drive's own."""
+    """One drive by one configuration, as it is sent to a worker. A configuration is a path; empty: the drive's own."""
 
     drive: Drive
     config: str
     options: Options
     limits: Limits
+    smoothed_by: str | None = None  # where there is no truth: the configuration of the smoother to compare with; None: none
     track: str = ""  # file to write the track to; empty: none
+    report: str = ""  # file to write the report to, instead of anything else; empty: none
 
     def known(self) -> dict[str, Any]:
         """The fields of its row that are known before anything is read."""

@@ -22,12 +22,13 @@ def of_configuration(path: str) -> str:
     return _hash([storage.digest(file) for file in files])
 
 
-def of_row(drive: Drive, configuration: str | None, options: Options) -> str:
-    """The key of the row of a drive by a configuration with this digest; None: the drive's own."""
-    if configuration is None:
-        configuration = _own(drive)
+def of_row(drive: Drive, configuration: str | None, options: Options, smoothed_by: str | None = "") -> str:
+    """The key of the row of a drive by configurations with these digests, and of the smoother that is compared with; None:
+    the drive's own."""
+    own = _own(drive) if configuration is None or smoothed_by is None else ""
+    configurations = [own if one is None else one for one in (configuration, smoothed_by)]
     files = [_about(file) for file in (*drive.logs, *filter(None, (drive.truth, drive.stored)))]
-    return _hash([__version__, LAYOUT, msgspec.json.encode(options).decode(), configuration, *files])
+    return _hash([__version__, LAYOUT, msgspec.json.encode(options).decode(), *configurations, *files])
 
 
 def _own(drive: Drive) -> str:

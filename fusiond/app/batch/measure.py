@@ -16,8 +16,11 @@ from fusiond.app.batch.job import Drive, DriveFile, Job
 from fusiond.app.batch.row import CalibrationRow, Row, SourceRow
 from fusiond.app.replay.comparison import Errors
 from fusiond.app.replay.files import short_names, stored_state, truth_of, with_short_names
+from fusiond.app.replay.job import Options as ReplayOptions
+from fusiond.app.replay.job import replay
 from fusiond.app.replay.outages import RECOVERY_S, OutageLog, OutageReport, course, parse_length, plan, report, withheld
-from fusiond.app.replay.replay import Replay, ReplayTask
+from fusiond.app.replay.replay import WHOLE, Replay, ReplayTask
+from fusiond.app.replay.smoothed import Smoothing
 from fusiond.app.replay.summary import Summary
 from fusiond.app.replay.truth import Truth, TruthSample
 from fusiond.config import load
@@ -42,7 +45,8 @@ def measure(job: Job) -> Row:
         try:
             files = stack.enter_context(_at_hand(job.drive))
             folders = {f"{path.parent}/": "" for path in files.values()}
-            return _Measurement(job, files, known).row()
+            measurement = _Measurement(job, files, known)
+            return measurement.reported() if job.report else measurement.row()
         except (UnusableError, UsageError) as error:
             return Row(status="failed", reason=with_short_names(str(error), folders), **known)
         except OSError as error:
@@ -109,13 +113,31 @@ class _Measurement:
     def __init__(self, job: Job, files: dict[str, Path], known: dict[str, Any]) -> None:
         self._job, self._files, self._known = job, files, known
         self._logs = job.drive.logs
-        own = job.drive.config
-        if not job.config and own is None:
-            raise UnusableError("no configuration lies beside the logs, and none was given")
-        self._config: Config = load.load(job.config or files[own.name if own else ""])
+        self._config = self._loaded(job.config)
         self._truth_file = files[job.drive.truth.name] if job.drive.truth else None
+        self._smoothed: list[TruthSample] = []  # the reference where there is no truth, if it is wanted
+
+    def _loaded(self, path: str) -> Config:
+        """A configuration; of an empty path the drive's own."""
+        own = self._job.drive.config
+        if not path and own is None:
+            raise UnusableError("no configuration lies beside the logs, and none was given")
+        return load.load(path or self._files[own.name if own else ""])
+
+    def reported(self) -> Row:
+        """Write the report of the drive."""
+        job, truth = self._job, self._truth_file
+        stored = self._files[job.drive.stored.name] if job.drive.stored else None
+        options = ReplayOptions(
+            self._config, str(self._known["config"]), self._paths(), truth=truth, stored=stored, report=Path(job.report),
+            rate_hz=job.options.rate_hz, bar=False,
+        )  # fmt: skip
+        replay(options)
+        return Row(status="ok", **self._known)
 
     def row(self) -> Row:
+        if self._job.smoothed_by is not None and self._truth_file is None:
+            self._smoothed = self._smooth(self._loaded(self._job.smoothed_by))
         first, track = Course(keeps=bool(self._job.options.outage)), None
         task = self._task()
         task.on_tick.append(first.add)
@@ -138,8 +160,26 @@ class _Measurement:
         outages = self._outages(run, first) if self._job.options.outage else None
         return self._told(summary, run, first, outages, Path(self._job.track).name)
 
+    def _smooth(self, config: Config) -> list[TruthSample]:
+        """The smoothed track by a configuration; empty where the logs give none."""
+        course = Course(keeps=True)
+        with ExitStack() as stack:
+            smoothing = Smoothing([course.add], stack)
+            task = self._task()
+            task.on_tick.append(smoothing.add_tick)
+            run = Replay(config, task)
+            smoothing.attach(run)
+            run.run(open_logs(self._paths(), config))
+            if run.first_ns is not None:
+                smoothing.finish(None, WHOLE)
+        return course.samples
+
+    def _paths(self) -> list[str]:
+        """The logs, as `replay` is given them."""
+        return [f"{log.link}={self._files[log.name]}" if log.link else str(self._files[log.name]) for log in self._logs]
+
     def _task(self) -> ReplayTask:
-        truth = truth_of(self._truth_file) if self._truth_file else None
+        truth = truth_of(self._truth_file) if self._truth_file else Truth(self._smoothed) if self._smoothed else None
         stored = self._job.drive.stored
         return ReplayTask(
             self._job.options.rate_hz,
@@ -148,8 +188,7 @@ class _Measurement:
         )
 
     def _run(self, task: ReplayTask) -> tuple[Replay, LogSet]:
-        paths = [f"{log.link}={self._files[log.name]}" if log.link else self._files[log.name] for log in self._logs]
-        logs = open_logs(paths, self._config)
+        logs = open_logs(self._paths(), self._config)
         run = Replay(self._config, task)
         run.run(logs)
         return run, logs
@@ -182,7 +221,7 @@ class _Measurement:
             distance_m=truth.distance_m if truth else first.distance_m,
             events=summary.events,
             warnings=summary.warnings,
-            reference="truth" if truth else "",
+            reference=("smoother" if self._smoothed else "truth") if truth else "",
             position_rmse_m=position.rmse_m if position else None,
             position_p95_m=position.p95_m if position else None,
             position_max_m=position.max_m if position else None,

@@ -51,7 +51,7 @@ class Row(Struct, frozen=True, kw_only=True):
     events: int = 0
     warnings: list[str] = []
     # Accuracy: errors of the published states against the reference
-    reference: Literal["", "truth", "smoother"] = ""
+    reference: Literal["", "truth", "smoother"] = ""  # the truth or, with --smooth, where there is none the smoothed track
     position_rmse_m: float | None = None  # horizontal
     position_p95_m: float | None = None
     position_max_m: float | None = None

@@ -8,10 +8,11 @@ from pathlib import Path
 from fusiond.app.batch import batch
 from fusiond.app.batch.batch import OWN, ROWS, SUMMARY, Order
 from fusiond.app.batch.engines import Cluster, Engine, LocalPool, cores
+from fusiond.app.batch.findings import WORST
 from fusiond.app.batch.job import Limits, Options
 from fusiond.app.batch.summary import text
 from fusiond.app.commands import EXIT_CODES
-from fusiond.app.commands.argument_types import count, positive, rate
+from fusiond.app.commands.argument_types import count, positive, rate, seed
 from fusiond.app.replay.outages import parse_length
 
 WORSE = 3  # exit code
@@ -46,6 +47,9 @@ def fill(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", metavar="DIR", type=Path, required=True, help="folder to write to; created if missing")
     add("--outage", metavar="LENGTH", default="", help="replay again with GNSS withheld again and again, for 60s or 1000m")
     add("--rate", metavar="HZ", type=rate, default=10.0, help="states a second that are compared; default: %(default)g")
+    add("--smooth", action="store_true", help="where there is no truth, compare with the smoother, of OLD if it is given")
+    about_reports = "reports of the worst drives (extra `report`); default: %(default)s"
+    add("--reports", metavar="N", type=seed, default=WORST, help=about_reports)
     add("--tracks", action="store_true", help="write the tracks too, as Parquet")
     add("--workers", metavar="N", type=count, default=cores(), help="processes; default: the processors, here %(default)s")
     add("--engine", choices=("local", "dask"), default="local", help="dask: a Dask cluster on this machine (extra `dask`)")
@@ -59,9 +63,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     if arguments.outage:
         parse_length(arguments.outage)
-    options = Options(rate_hz=arguments.rate, outage=arguments.outage, tracks=arguments.tracks)
+    options = Options(rate_hz=arguments.rate, outage=arguments.outage, smooth=arguments.smooth, tracks=arguments.tracks)
     limits = Limits(seconds=arguments.seconds, memory_mb=arguments.memory)
-    order = Order(arguments.drives, arguments.out, arguments.config, arguments.baseline, options, limits)
+    order = Order(
+        arguments.drives, arguments.out, arguments.config, arguments.baseline, options, limits, reports=arguments.reports
+    )
     batch.check(order)
     if arguments.dry_run:
         print(batch.dry(order))

@@ -19,6 +19,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "config/test_autopilots.py": "the configurations for autopilots, and the autopilots' parameters beside them",
     "app/report/test_in_a_browser.py": "a whole report in a headless browser",
     "adapters/zenoh/test_security.py": "the sample configurations for TLS and access control",
+    "adapters/zenoh/test_yard.py": "the sample configuration of a router for many vehicles",
     "app/commands/test_command_line.py": "all commands, by their command lines",
     "app/commands/test_commands.py": "what every command has in common",
     "app/live/test_hostile.py": "the daemon among hostile processes: UDP, signing, network namespace",

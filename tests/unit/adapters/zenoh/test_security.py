@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import shutil
 import socket
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +21,7 @@ from fusiond.config.schema import Config, Vehicle
 from fusiond.messages.types import EventMessage
 from fusiond_adapters.zenoh.queries import Answers
 from fusiond_adapters.zenoh.session import ZenohPublisher, open_session, session_config
+from tests.helpers.certificates import certify, openssl
 from tests.helpers.paths import ROOT
 from tests.helpers.zenoh import endpoint as free_endpoint
 from tests.helpers.zenoh import publishing, sees, settings
@@ -31,24 +31,13 @@ DEADLINE = 15.0  # s
 PLACE = "/etc/fusiond/zenoh"
 
 
-def openssl(*arguments: object) -> None:
-    subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True)
-
-
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The samples, with certificates, in a folder of their own."""
     if shutil.which("openssl") is None:
         pytest.skip("makes its certificates with openssl")
     folder = tmp_path_factory.mktemp("zenoh")
-    curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", 2)
-    openssl("req", "-x509", *curve, "-subj", "/CN=authority", "-keyout", folder / "ca.key", "-out", folder / "ca.pem")
-    for name in ("router", "rover", "reader"):
-        request, key, names = folder / f"{name}.csr", folder / f"{name}.key", folder / f"{name}.ext"
-        names.write_text("subjectAltName=IP:127.0.0.1\nbasicConstraints=CA:FALSE\n")
-        openssl("req", *curve[:-2], "-subj", f"/CN={name}", "-keyout", key, "-out", request)
-        openssl("x509", "-req", "-in", request, "-CA", folder / "ca.pem", "-CAkey", folder / "ca.key", "-CAcreateserial",
-                "-days", 2, "-extfile", names, "-out", folder / f"{name}.pem")  # fmt: skip
+    certify(folder, "router", "rover", "reader")
     for sample in SAMPLES.glob("*.json5"):
         (folder / sample.name).write_text(sample.read_text().replace(PLACE, str(folder)))
     return folder

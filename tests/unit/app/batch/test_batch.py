@@ -138,12 +138,16 @@ def test_a_worse_configuration_ends_with_a_status_of_its_own(
     old = fleet.configuration(tmp_path, "old.toml")
     new = fleet.configuration(tmp_path, "new.toml", ("position_sigma_m = 0.539", "position_sigma_m = 1.617"))
     command = ["batch", str(tmp_path / "fleet"), "-o", str(tmp_path / "out"), "--rate", "2", "--workers", "1"]
+    command += ["--reports", "1"]
     assert main([*command, "--config", str(new), "--baseline", str(old)]) == 3
     said = capsys.readouterr().out
     assert "NEW is significantly worse" in said and "14 drives: 14 ok" in said
     page = (tmp_path / "out" / SUMMARY).read_text()
     assert "NEW is significantly worse" in page and page.count("<svg") == 5
-    assert not re.search(r"""(?:src|href)=["'](?!#)""", page.replace("xlink:href", "href"))  # nothing is fetched
+    assert not re.search(r"""(?:src|href)=["'](?!#)""", page.replace("xlink:href", "href").replace('<a href="reports/', ""))
+    ((drive, where),) = re.findall(r'<a href="(.*?)">(.*?)</a>', page)
+    assert "<html" in (tmp_path / "out" / drive).read_text() and where.startswith(str(tmp_path / "fleet"))
+    command[-1] = "0"
     assert main([*command, "--config", str(old), "--baseline", str(old)]) == 0
     assert "no significant difference" in capsys.readouterr().out
     assert main([*command, "--config", str(old), "--baseline", str(tmp_path / "out" / ROWS)]) == 2  # would be overwritten
@@ -177,6 +181,20 @@ def test_tracks_and_outages(tmp_path: Path) -> None:
     assert blind.distance_m == pytest.approx(row.distance_m, rel=0.02)
     assert blind.outages[0].error_m == pytest.approx(outage.error_m, abs=1.5)
     assert row.outage_68_percent is not None and 0 < row.outage_68_percent < 5
+
+
+def test_without_a_truth_the_smoother_is_the_reference(tmp_path: Path) -> None:
+    (drive,) = fleet.drives(tmp_path / "fleet", range(1), 60.0)
+    done(Order([str(drive)], tmp_path / "out", options=OPTIONS), LocalPool(1))
+    ((_, _, true),) = read_rows(tmp_path / "out" / ROWS)
+    (drive / "truth.csv").unlink()
+    wanted = Order([str(drive)], tmp_path / "out", baseline=OWN, options=Options(rate_hz=5.0, smooth=True))
+    done(wanted, LocalPool(1))
+    ((_, _, row),) = read_rows(tmp_path / "out" / ROWS)
+    ((_, _, old),) = read_rows(tmp_path / "out" / "baseline.parquet")
+    assert row == old and row.reference == "smoother"
+    assert row.position_rmse_m is not None and 0.01 < row.position_rmse_m < 2.0
+    assert (true.reference, row.states) == ("truth", true.states)
 
 
 @pytest.mark.parametrize(
