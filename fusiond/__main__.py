@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UsageError as error:
         return _failed(str(error), USAGE)
     except UnusableError as error:
-        return _failed(str(error), UNUSABLE)
+        return _failed(str(error), error.code)
     except BrokenPipeError:  # the reader of our output has gone; keep the interpreter from flushing into it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNUSABLE

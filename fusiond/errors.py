@@ -10,6 +10,8 @@ class UsageError(Exception):
 class UnusableError(Exception):
     """An input that cannot be used, or an output that cannot be written; the message says which and why."""
 
+    code = 1  # the exit code of a command that it ends
+
 
 class OutputError(UnusableError):
     """A result cannot be delivered; the message says where and why."""

@@ -108,6 +108,18 @@ class LogSet:
         return {str(log.file.path): log.counts() for log in self._logs}
 
     @property
+    def apart_s(self) -> float:
+        """By how much the MAVLink and the CAN logs miss each other [s]; 0 if they overlap, or there are none of a kind."""
+        read = [log for log in self._logs if log.first_ns is not None]
+        gaps = [
+            max(link.first_ns or 0, bus.first_ns or 0) - min(link.last_ns, bus.last_ns)
+            for link in read
+            for bus in read
+            if (link.protocol, bus.protocol) == ("mavlink", "can")
+        ]
+        return max(0, min(gaps, default=0)) / SECOND
+
+    @property
     def warnings(self) -> list[str]:
         """Warnings about the logs, complete once they are read."""
         found = [warning for log in self._logs for warning in log.file.warnings]
@@ -115,7 +127,7 @@ class LogSet:
         found += [f"{log.file.path}: nothing in it that the configuration asks for" for log in empty]
         links = [log for log in self._logs if log.first_ns is not None and log.protocol == "mavlink"]
         buses = [log for log in self._logs if log.first_ns is not None and log.protocol == "can"]
-        if links and buses and not any(link.overlaps(bus) for link in links for bus in buses):
+        if self.apart_s:
             spans = "; ".join(log.span() for log in (*links, *buses))
             found.append(f"the MAVLink and the CAN logs do not overlap in time: {spans}")
         return found
@@ -197,11 +209,6 @@ class _Log:
         for decoder in self._reading.decoders:
             total.update(decoder.counts)
         return {name: count for name, count in total.items() if count}
-
-    def overlaps(self, other: _Log) -> bool:
-        if self.first_ns is None or other.first_ns is None:
-            return False
-        return self.first_ns <= other.last_ns and other.first_ns <= self.last_ns
 
     def span(self) -> str:
         first, last = (_readable(t_ns) for t_ns in (self.first_ns or 0, self.last_ns))

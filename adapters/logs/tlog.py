@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from struct import Struct
+from typing import Protocol
 
 from fusiond.events import Received
 from fusiond.units import MICROSECOND
@@ -28,6 +29,7 @@ from fusiond_adapters.mavlink.decoder import (
     MAX_FRAME_BYTES,
     SIGNATURE,
     SIGNED,
+    Dialect,
     MavlinkDecoder,
     frame_length,
 )
@@ -55,7 +57,21 @@ def open_log(opening: Opening) -> Reading:
     return Reading("mavlink", [decoder], read_tlog(opening.file, decoder))
 
 
-def read_tlog(log: LogFile, decoder: MavlinkDecoder) -> Iterator[list[Received]]:
+class FrameDecoder(Protocol):
+    """What makes events of frames: MavlinkDecoder, or what stands in for it."""
+
+    dialect: Dialect
+
+    def decode(self, frame: bytes, t_receive_ns: int) -> list[Received]:
+        """The events in one frame."""
+
+    def decode_by_header(
+        self, number: int, counter: int, system: int, component: int, frame: bytes, t_receive_ns: int, /
+    ) -> list[Received]:
+        """The same for a frame whose header has been read."""
+
+
+def read_tlog(log: LogFile, decoder: FrameDecoder) -> Iterator[list[Received]]:
     """The events of a .tlog, frame by frame in the order of the file. Raises LogError if it has no MAVLink frame."""
     yield from _Records(log, decoder)
     if not log.counts["records"]:
@@ -65,7 +81,7 @@ def read_tlog(log: LogFile, decoder: MavlinkDecoder) -> Iterator[list[Received]]
 class _Records:
     """Cuts a .tlog into records and decodes them."""
 
-    def __init__(self, log: LogFile, decoder: MavlinkDecoder) -> None:
+    def __init__(self, log: LogFile, decoder: FrameDecoder) -> None:
         self._log = log
         self._blocks = log.blocks()
         self._counts = log.counts

@@ -114,6 +114,10 @@ class Dialect:
             raise ConfigError(f"the MAVLink dialect '{self.name}' has no message {message}")
         return self._types[self.ids[message]]
 
+    def name_of(self, number: int) -> str:
+        """The name of a message; its number as text where the dialect does not know it."""
+        return str(self._types[number].msgname) if number in self._types else str(number)
+
     def knows(self, number: int) -> bool:
         """Is a message known by its id, and so the seed of its checksum?"""
         return number in self._seeds

@@ -34,6 +34,16 @@ def calibrations(params: Parameters, state: FilterState) -> dict[str, tuple[floa
     return found
 
 
+def first_sigmas(params: Parameters) -> dict[str, float]:
+    """The initial sigma of every calibration that is learnt, by the same names."""
+    variances = params.calibration_variances
+    return {
+        name: math.sqrt(float(variances[place - CALIBRATIONS])) * unit
+        for place, name, unit in _names(params)
+        if place < params.size and variances[place - CALIBRATIONS] > 0
+    }
+
+
 def _names(params: Parameters) -> Iterator[tuple[int, str, float]]:
     """Error state, name and factor to the unit in it."""
     for group, name in enumerate(params.scales):

@@ -16,6 +16,7 @@ COMMANDS = {
     "smooth": "smooth recorded logs: each state from all that was measured, before and after it",
     "report": "fuse recorded logs, and write one HTML file that shows the drive and what became of its data",
     "batch": "replay many drives, and tell whether a configuration is better on them",
+    "doctor": "find what the data of recorded logs say against a configuration",
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
     "fleet": "show many running vehicles at once, and their alarms",
     "check": "explain what a configuration does, or what is wrong with it",
@@ -26,7 +27,10 @@ COMMANDS = {
     "completion": "print a script that completes fusiond's command line with the tab key",
 }
 
-EXIT_CODES = "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 130 interrupted"
+EXIT_CODES = (
+    "exit codes: 0 success, 1 unusable input or unwritable output, 2 wrong usage or configuration, 3 a replay without a"
+    " state, 4 a replay whose data contradict the configuration, 130 interrupted"
+)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import positive, rate
 from fusiond.app.commands.arguments import add_config_and_logs, add_verbosity, taken_config
 from fusiond.app.commands.replayed import add_circumstances, circumstances
+from fusiond.app.diagnosis.finding import exit_code, lines
 from fusiond.app.replay.job import Options, replay
 from fusiond.app.replay.outages import parse_length
 from fusiond.app.replay.summary import details, text
@@ -63,8 +64,8 @@ def fill(parser: argparse.ArgumentParser) -> None:
     add("--outputs", action="store_true", help="send to every output that the configuration turns on, including Zenoh")
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; returns the exit code."""
     name = taken_config(arguments)
     loaded = config.load(name)
     if arguments.outage_length and not arguments.truth:
@@ -92,9 +93,10 @@ def run(arguments: argparse.Namespace) -> None:
     with config.located(name):
         summary = replay(options)
     if arguments.quiet:
-        for warning in summary.warnings:
-            print(painted(f"warning: {warning}", "yellow", sys.stderr), file=sys.stderr)
+        for line in (*(f"warning: {warning}" for warning in summary.warnings), *lines(summary.findings)):
+            print(painted(line, "yellow", sys.stderr), file=sys.stderr)
     else:
         print(text(summary))
     if arguments.verbose:
         print("\n".join(details(summary)))
+    return exit_code(summary.findings)

@@ -73,10 +73,10 @@ class Mounting(NamedTuple):
 def find(windows: Windows, configured_deg: tuple[float, float, float]) -> Mounting:
     """The rotation of the sensor's own axes against forward-right-down, from samples that were rotated as configured. Raises
     MountingError if the drive does not determine it."""
-    directions = _directions(windows)
+    directions = directions_of(windows)
     mat_vs, covariance = _wahba(directions)
     sigma = np.sqrt(np.diag(covariance))
-    off = [_angle(mat_vs @ direction.sensed, direction.vehicle) for direction in directions]
+    off = [angle_between(mat_vs @ direction.sensed, direction.vehicle) for direction in directions]
     acceleration, turning = _size(windows.acceleration), _size(windows.turn[np.isfinite(windows.turn)])
     for direction, angle in zip(directions, off, strict=True):
         if direction.sigma < MAX_CERTAIN_SIGMA and angle > CONTRADICTION:
@@ -104,9 +104,10 @@ def find(windows: Windows, configured_deg: tuple[float, float, float]) -> Mounti
     )
 
 
-def _directions(windows: Windows) -> list[Direction]:
-    """The directions of down and forward that the drive determines."""
-    found, bias = _by_turning(windows)
+def directions_of(windows: Windows) -> list[Direction]:
+    """The directions of down and forward that the drive determines. Raises MountingError."""
+    axis = turning_axis(windows)
+    found, bias = ([axis.direction], axis.bias) if axis else ([], np.zeros(3))
     segments = _segments(windows, bias)
     if not segments:
         seconds = f"{MIN_SEGMENT_WINDOWS * WINDOW:.0f} s"
@@ -126,14 +127,24 @@ def _directions(windows: Windows) -> list[Direction]:
     return found
 
 
-def _by_turning(windows: Windows) -> tuple[list[Direction], Array]:
-    """Down as the axis that the gyro measures while the course changes, if it does; and the gyro's bias (3,) [rad/s]."""
+class TurningAxis(NamedTuple):
+    """What the gyro measures while the course changes: one of it per unit of the course's, about down, if all is right."""
+
+    direction: Direction
+    gain: float  # 1: of the gyro's rate over the course's
+    gain_sigma: float
+    bias: Array  # (3,) rad/s
+
+
+def turning_axis(windows: Windows) -> TurningAxis | None:
+    """The axis that the gyro measures while the course changes; None where the course is not known for long enough."""
     known = np.isfinite(windows.turn)
     if known.sum() < MIN_WINDOWS:
-        return [], np.zeros(3)
+        return None
     design = np.stack([np.ones(known.sum()), windows.turn[known]], axis=1)[:, :, None, None] * np.eye(3)
     (bias, axis), spread = _regress(windows.rate[known].mean(axis=1), design)
-    return [_direction("turning", axis, DOWN, spread[1], TURNING_SIGMA)], bias
+    direction = _direction("turning", axis, DOWN, spread[1], TURNING_SIGMA)
+    return TurningAxis(direction, float(np.linalg.norm(axis)), float(spread[1]), bias)
 
 
 def _level(ups: Array, weights: NDArray[np.int64]) -> Direction:
@@ -144,7 +155,7 @@ def _level(ups: Array, weights: NDArray[np.int64]) -> Direction:
         raise MountingError(
             f"the accelerometer reads {gravity:.2f} m/s^2 on average, which is not gravity: is its unit wrong?"
         )
-    off = np.array([_angle(up, one) for one in ups])
+    off = np.array([angle_between(up, one) for one in ups])
     scatter = math.sqrt((2 * ROAD_SIGMA * ROAD_SIGMA + float(off @ off) / 2) / (1 + len(ups)))
     return Direction("level", -up / gravity, DOWN, math.hypot(scatter / math.sqrt(len(ups)), LEVEL_SIGMA))
 
@@ -230,7 +241,7 @@ def _euler(mat_bs: Array) -> tuple[float, float, float]:
     return 0.0, math.copysign(math.pi / 2, -float(mat_bs[2, 0])), math.atan2(-float(mat_bs[0, 1]), float(mat_bs[1, 1]))
 
 
-def _angle(a: Array, b: Array) -> float:
+def angle_between(a: Array, b: Array) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
 
 

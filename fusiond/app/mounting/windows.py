@@ -46,7 +46,8 @@ class Windows(NamedTuple):
         return change
 
 
-Bins = dict[int, Array]
+Bins = dict[int, list[float]]  # by number of the bin: count of the readings, and their sums
+MAX_BINS = 72_000  # of a source: two hours; what comes later is not gathered
 
 
 class Gathering:
@@ -55,44 +56,44 @@ class Gathering:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._span_ns: tuple[int, int] | None = None
-        self._moved_ns = 0  # added to the stamps of the present session
-        self._imu: Bins = {}
-        self._course: Bins = {}
-        self._wheels: dict[str, Bins] = {name: {} for name in config.wheel}
+        self.moved_ns = 0  # added to the stamps of the present session
+        self.imu: Bins = {}  # specific force, angular rate
+        self.course: Bins = {}  # velocity north, east
+        self.wheels: dict[str, Bins] = {name: {} for name in config.wheel}  # speed
 
     def begin_session(self, t_receive_ns: int) -> None:
         """Receipts have stepped back, to this one: what follows is placed after all the rest."""
         if self._span_ns:
-            self._moved_ns = self._span_ns[1] + APART_NS - t_receive_ns
+            self.moved_ns = self._span_ns[1] + APART_NS - t_receive_ns
 
     def add(self, measurement: Measurement) -> None:
         """Add one event; other kinds are ignored."""
-        payload, t_ns = measurement.payload, measurement.t_ns + self._moved_ns
+        payload, t_ns = measurement.payload, measurement.t_ns + self.moved_ns
         if isinstance(payload, ImuSample):
             self._span_ns = (self._span_ns or (t_ns, 0))[0], t_ns
-            _put(self._imu, t_ns, (*payload.specific_force_b, *payload.angular_rate_b))
+            _put(self.imu, t_ns, payload.specific_force_b + payload.angular_rate_b)
         elif isinstance(payload, GnssVelocity):
-            _put(self._course, t_ns, (payload.north, payload.east))
+            _put(self.course, t_ns, (payload.north, payload.east))
         elif isinstance(payload, WheelSpeed):
-            _put(self._wheels[measurement.source], t_ns, (payload.speed,))
+            _put(self.wheels[measurement.source], t_ns, (payload.speed,))
 
     @property
     def elapsed_ns(self) -> int:
         """From the first inertial sample to the newest."""
         return self._span_ns[1] - self._span_ns[0] if self._span_ns else 0
 
-    def windows(self) -> Windows:
-        """Means over whole windows in which a speed is known. Raises MountingError if there are too few."""
-        if not self._imu:
+    def windows(self, *, by_gnss: bool = False) -> Windows:
+        """Means over whole windows in which a speed is known, with `by_gnss` from GNSS in place of the wheels. Raises
+        MountingError if there are too few."""
+        if not self.imu:
             raise MountingError("the logs have no sample of the inertial sensor")
-        keys = np.array(sorted(self._imu))
+        keys, means = means_of(self.imu)
         numbers, starts, counts = np.unique(keys // WINDOW_BINS, return_index=True, return_counts=True)
         numbers, starts = numbers[counts == WINDOW_BINS], starts[counts == WINDOW_BINS]
-        means = np.array([self._imu[key][1:] / self._imu[key][0] for key in keys.tolist()])
         samples = means[starts[:, None] + np.arange(WINDOW_BINS)]
         ends = np.stack([numbers, numbers + 1]) * WINDOW_BINS
-        course = _at(self._course, ends, 2)
-        wheels = {name: _at(bins, ends, 1)[..., 0] for name, bins in self._wheels.items() if bins}
+        course = at(self.course, ends, 2)
+        wheels = {name: at(bins, ends, 1)[..., 0] for name, bins in self.wheels.items() if bins and not by_gnss}
         speeds, speed_from = self._speeds(course, wheels)
         known = np.isfinite(speeds).all(axis=0)
         if known.sum() < MIN_WINDOWS:
@@ -133,19 +134,28 @@ class Gathering:
 
 def _put(bins: Bins, t_ns: int, values: tuple[float, ...]) -> None:
     total = bins.get(t_ns // BIN_NS)
-    if total is None:
-        total = bins[t_ns // BIN_NS] = np.zeros(1 + len(values))
-    total += (1.0, *values)
+    if total is not None:
+        total[0] += 1.0
+        for place, value in enumerate(values, 1):
+            total[place] += value
+    elif len(bins) < MAX_BINS:
+        bins[t_ns // BIN_NS] = [1.0, *values]
 
 
-def _at(bins: Bins, instants: NDArray[np.int64], width: int) -> Array:
+def means_of(bins: Bins) -> tuple[NDArray[np.int64], Array]:
+    """The numbers of the bins (K,), in order, and the means of their readings (K, n)."""
+    keys = np.array(sorted(bins))
+    totals = np.array([bins[key] for key in keys.tolist()])
+    return keys, totals[:, 1:] / totals[:, :1]
+
+
+def at(bins: Bins, instants: NDArray[np.int64] | Array, width: int) -> Array:
     """Means of a source (..., width) at some instants, counted in bins: interpolated between the two nearest; nan if those
     are far apart."""
     found = np.full((*instants.shape, width), math.nan)
     if len(bins) < 2:
         return found
-    keys = np.array(sorted(bins))
-    means = np.array([bins[key][1:] / bins[key][0] for key in keys.tolist()])
+    keys, means = means_of(bins)
     after = np.clip(np.searchsorted(keys + 0.5, instants), 1, len(keys) - 1)
     apart = keys[after] - keys[after - 1]
     share = (instants - keys[after - 1] - 0.5) / apart

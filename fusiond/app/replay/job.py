@@ -12,6 +12,8 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from fusiond.app.diagnosis.diagnose import diagnose, missing
+from fusiond.app.diagnosis.finding import NothingAskedFor, exit_code, lines, located
 from fusiond.app.kernel import slow_kernel
 from fusiond.app.progress import shown
 from fusiond.app.replay.comparison import Window
@@ -45,12 +47,12 @@ from fusiond.app.replay.smoothed import Smoothing
 from fusiond.app.replay.summary import Summary, to_json
 from fusiond.app.replay.trace import Trace
 from fusiond.app.report.gathered import Gathered
+from fusiond.config.explain import oddities
 from fusiond.config.schema import Config
 from fusiond.errors import UsageError
 from fusiond.filter.hot_start import WORDS
 from fusiond.filter.state import Verdict
 from fusiond.messages.info import info_message
-from fusiond_adapters.logs.file import LogError
 from fusiond_adapters.logs.merge import LogSet, open_logs
 
 
@@ -216,16 +218,21 @@ def _open_files(options: Options, task: ReplayTask, stack: ExitStack) -> None:
 
 
 def _summary(options: Options, run: Replay, logs: LogSet, attached_warnings: Sequence[str]) -> Summary:
-    """The summary. Raises LogError if no event was read."""
-    names = short_names(logs.counts)
+    """The summary, with findings. Raises NothingAskedFor if no event was read."""
+    names, sources, file = short_names(logs.counts), run.sources(), options.config.path(options.config_name)
     if run.first_ns is None:
         found = "; ".join(f"{names[path]}: {counts}" for path, counts in logs.counts.items())
-        raise LogError(f"nothing in the logs that the configuration asks for ({found})")
+        why = "\n".join(lines(located(missing(options.config, sources, logs), file)))
+        raise NothingAskedFor(f"nothing in the logs that the configuration asks for ({found})\n{why}")
     warnings = [with_short_names(warning, names) for warning in logs.warnings]
     summary = run.summary(options.config_name, {names[path]: counts for path, counts in logs.counts.items()}, warnings)
     if options.stored and (verdict := run.fusion.hot_start()) is not Verdict.USED:
         warnings.append(f"stored state: {WORDS[verdict]}")
     if options.truth and summary.truth is None:
         warnings.append(f"{options.truth.name}: no published state to compare with it; is it of this drive?")
+    has_state = summary.final.state is not None
+    findings = located(diagnose(run.evidence, run.fusion, sources, logs, has_state=has_state), file)
+    if exit_code(findings):
+        warnings += oddities(options.config)
     warnings += attached_warnings
-    return summary
+    return replace(summary, findings=findings)

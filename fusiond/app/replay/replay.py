@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fusiond import __version__
+from fusiond.app.diagnosis.evidence import Evidence
 from fusiond.app.replay.comparison import Comparison, Errors, Window, errors_of
 from fusiond.app.replay.intervals import Withheld
 from fusiond.app.replay.summary import (
@@ -80,11 +81,13 @@ class Replay:
         )
         self.fusion = self.engine.fusion
         self._withheld: Counter[str] = Counter()
+        self._sessions = 0  # that followed the first
         self._modes: Counter[str] = Counter()
         self._latencies = {source: Latencies() for source in config.sources()}
         self._lateness: dict[str, TooOld] = {}  # by source
         self._comparison = Comparison(task.window)
         self._reckoning = DeadReckoningLog(config.filter.position_timeout_s)
+        self.evidence = Evidence(config)
 
     def run(self, events: Iterable[Received]) -> None:
         """Feed all events, in order of receipt."""
@@ -118,6 +121,10 @@ class Replay:
         if receipt is None:
             self.clock_pairs += isinstance(event.payload, ClockPair)
             return
+        if len(self.engine.steps_back) > self._sessions:
+            self._sessions = len(self.engine.steps_back)
+            self.evidence.begin_session(event.t_receive_ns)
+        self.evidence.add(receipt)
         if receipt.refusal is Outcome.TOO_OLD:
             self._note_lateness(event, receipt)
         if receipt.refusal is not Outcome.INVALID:
@@ -168,7 +175,7 @@ class Replay:
             events=self.events,
             clock_pairs=self.clock_pairs,
             rerun=self.fusion.history.rerun,
-            sources=self._sources(),
+            sources=self.sources(),
             clocks=self.fusion.clock.report(),
             final=engine.message(engine.now_ns),
             published=published,
@@ -176,7 +183,8 @@ class Replay:
             truth=self._comparison.report(),
         )
 
-    def _sources(self) -> dict[str, SourceReport]:
+    def sources(self) -> dict[str, SourceReport]:
+        """What came of each source, and its outcomes."""
         outcomes, fusion = self.fusion.outcomes(), self.fusion
         return {
             name: source_report(

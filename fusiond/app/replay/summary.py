@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 import msgspec
 from msgspec import Struct
 
+from fusiond.app.diagnosis.finding import Finding, lines
 from fusiond.app.replay.comparison import AngleReport, Errors, TruthReport
 from fusiond.app.replay.outages import OutageReport
 from fusiond.app.replay.statistics import Histogram
@@ -145,6 +146,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     truth: TruthReport | None = None
     outages: OutageReport | None = None
     smoothed: SmoothedReport | None = None
+    findings: list[Finding] = []  # what the data say against the configuration, see docs/doctor.md
 
 
 def to_json(summary: Summary) -> bytes:
@@ -281,6 +283,9 @@ def _lines(summary: Summary) -> Iterator[str]:
     yield from _remarks(summary)
     yield ""
     yield from _state(summary)
+    if summary.findings:
+        yield ""
+        yield from lines(summary.findings)
     if summary.published:
         yield from _published(summary.published)
     if summary.dead_reckoning:
@@ -359,7 +364,8 @@ def _state(summary: Summary) -> Iterator[str]:
     message = summary.final
     state = message.state
     if state is None:
-        yield f"final state    none: {message.fault or 'the filter never had enough data to start'}"
+        reasons = [one.text for one in summary.findings if one.weight == "no_state"]
+        yield f"final state    none: {message.fault or '; '.join(reasons) or 'the filter never had enough data to start'}"
         return
     north, east, down = state.sigma_position_ned_m
     vn, ve, _ = state.velocity_ned_mps
