@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from fusiond import __version__
+from fusiond.app.diagnosis.finding import NO_STATE
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
@@ -259,7 +260,9 @@ def run_python(*arguments: str) -> tuple[float, float]:
         code += f"runpy.run_module({arguments[0]!r}, run_name='__main__', alter_sys=True)"
         rest = list(arguments)
     wrapped = f"{PRINT_USAGE}\n{code}"
-    done = subprocess.run([sys.executable, "-c", wrapped, *rest], check=True, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", wrapped, *rest], check=False, capture_output=True, text=True)
+    if done.returncode not in (0, NO_STATE):  # a short drive may end before it has a state
+        raise subprocess.CalledProcessError(done.returncode, done.args, done.stdout, done.stderr)
     _, seconds, peak = next(line for line in reversed(done.stdout.splitlines()) if line.startswith("USED")).split()
     return float(seconds), int(peak) / 1024
 

@@ -108,6 +108,11 @@ class LogSet:
         return {str(log.file.path): log.counts() for log in self._logs}
 
     @property
+    def protocols(self) -> frozenset[str]:
+        """The sections of the configuration whose logs were given, such as mavlink."""
+        return frozenset(log.protocol for log in self._logs)
+
+    @property
     def apart_s(self) -> float:
         """By how much the MAVLink and the CAN logs miss each other [s]; 0 if they overlap, or there are none of a kind."""
         read = [log for log in self._logs if log.first_ns is not None]

@@ -31,7 +31,7 @@ def missing(config: Config, sources: Mapping[str, SourceReport], logs: LogSet) -
         counts.update(one)
     silent = any(not report.events and not report.withheld for report in sources.values())
     sent: list[Sent] = [one for path in logs.counts if silent and ".tlog" in path for one in census(path)]
-    return [*_apart(logs), *input_findings(config, sources, sent, counts)]
+    return [*_apart(logs), *input_findings(config, sources, sent, counts, logs.protocols)]
 
 
 def diagnose(
@@ -43,7 +43,7 @@ def diagnose(
     if not any(one.kind == "gnss_velocity" for one in causes):  # by which the others are judged
         causes += [*wheel_findings(evidence), *receiver_findings(evidence)]
     if not has_state:
-        grave = [one for one in causes if one.weight != "note"]
+        grave = [one for one in causes if one.weight != "note" or one.kind == "no_log"]
         without = grave[:1] or list(start_findings(evidence, sources))
         rest = [one for one in causes if one not in without]
         return [*(replace(one, weight="no_state") for one in without), *rest]

@@ -36,7 +36,8 @@ class Finding(Struct, frozen=True, kw_only=True):
 
 def located(findings: Iterable[Finding], file: Path) -> list[Finding]:
     """The same findings with the line of each key; of a key that is not given, that of its table."""
-    text = read_text(file)
+    findings = list(findings)
+    text = read_text(file) if findings else ""
     return [replace(one, place=f"{file.name}:{line_of(one.key, text)}") if one.key else one for one in findings]
 
 

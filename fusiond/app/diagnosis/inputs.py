@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 
 from fusiond.app.diagnosis.finding import Finding, Weight
 from fusiond.app.replay.summary import SourceReport
 from fusiond.config.schema import Config, Source
+from fusiond.config.sensor import INPUTS
 from fusiond.filter.observations import IMU
 from fusiond.filter.parameters import model_of
 from fusiond_adapters.logs.census import Sent
@@ -25,14 +26,34 @@ SHOWN = 4  # messages of a sender that are listed
 
 
 def input_findings(
-    config: Config, sources: Mapping[str, SourceReport], sent: list[Sent], counts: Mapping[str, int]
+    config: Config,
+    sources: Mapping[str, SourceReport],
+    sent: list[Sent],
+    counts: Mapping[str, int],
+    protocols: Set[str],
 ) -> Iterator[Finding]:
-    """What is missing or of no use. `sent`: the messages of the .tlogs; `counts`: those of the readers over all logs."""
+    """What is missing or of no use. `sent`: the messages of the .tlogs; `counts`: those of the readers over all logs;
+    `protocols`: of which there is a log."""
     streams = config.streams()
     told: set[str] = set()
     for name, report in sources.items():
         source = streams[name]
         sensor = f"{source.table}.{source.name}"
+        without_log = [
+            f"{table}.{source.section.inputs()[key]}"
+            for key, table in INPUTS.items()
+            if key in source.section.inputs() and table not in protocols
+        ]
+        if without_log:
+            (where,) = without_log
+            if where not in told:
+                told.add(where)
+                yield Finding(
+                    kind="no_log",
+                    weight="note",
+                    text=f"no log of {where} is given, so {source.name} and its like are missing",
+                )
+            continue
         if report.withheld or not source.stream.enabled or sensor in told:
             continue
         if not report.events:

@@ -8,7 +8,6 @@ import numpy as np
 
 from fusiond.app.diagnosis.evidence import Evidence
 from fusiond.app.diagnosis.finding import Finding
-from fusiond.app.diagnosis.wheels import motion_by_gnss
 from fusiond.app.replay.summary import SourceReport
 
 
@@ -26,13 +25,13 @@ def start_findings(evidence: Evidence, sources: Mapping[str, SourceReport]) -> I
             "no_position", f"none of {events} fixes could be used, so no position is known", f"gnss.{first}.minimum_fix_type"
         )
         return
-    motion = motion_by_gnss(evidence)
-    if motion is None:
+    speeds = [np.hypot(*one.arrays()[1].T) for one in evidence.velocities.values() if len(one)]
+    if not speeds:
         extent = max(float(np.hypot(*np.ptp(one.arrays()[1], axis=0))) for one in evidence.positions.values() if len(one))
         words = f"heading unknown: the {fixes} fixes have no velocity and lie within {extent:.1f} m; give heading_deg"
         yield _none("no_heading", words, "filter.heading_deg")
         return
-    fastest = float(np.max(motion.speed))
+    fastest = max(float(one.max()) for one in speeds)
     limit = config.filter.course_speed_mps
     words = f"heading unknown: by GNSS never faster than {fastest:.1f} m/s"
     more = f", and only above course_speed_mps ({limit:g} m/s) the course is the heading at once" if fastest < limit else ""

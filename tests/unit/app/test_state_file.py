@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from fusiond.__main__ import main
+from fusiond.app.diagnosis.finding import NO_STATE
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.state_file import StateFile, read_state
 from fusiond.config import load as config
@@ -107,7 +108,7 @@ def test_killed_and_started_again(tmp_path: Path, bus: can.BusABC) -> None:
     more = ["--stored", str(state_file), "--csv", str(csv)]
     assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, *more]) == 0
     assert ",nominal\n" in csv.read_text()
-    assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, "--csv", str(csv)]) == 0
+    assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, "--csv", str(csv)]) == NO_STATE
     assert ",nominal\n" not in csv.read_text()
     for wrong in (tmp_path / "none.json", tmp_path / "live.toml"):
         assert main(["replay", "--config", str(tmp_path / "live.toml"), *logs, "--stored", str(wrong)]) == 1

@@ -17,6 +17,7 @@ import zenoh
 
 from fusiond.__main__ import INTERRUPTED, SUCCESS, UNUSABLE, USAGE, main
 from fusiond.app.demo.demo import explanation
+from fusiond.app.diagnosis.finding import CONTRADICTED, NO_STATE
 from fusiond.app.replay.summary import Summary
 from fusiond.config.outputs import Zenoh
 from fusiond.messages.codec import decode
@@ -278,6 +279,33 @@ def test_logs_of_one_name_are_distinguished(replay: Run, folder: Path, tmp_path:
     }
 
 
+def test_a_wrong_unit_is_named_by_doctor_and_by_replay(replay: Run, run: Run, folder: Path, tmp_path: Path) -> None:
+    """With its line, and an exit code of its own; without findings the doctor says so."""
+    text = (folder / "fusiond.toml").read_text()
+    wrong = folder / "wrong.toml"
+    wrong.write_text(text.replace('unit = "km/h"', 'unit = "m/s"', 1))
+    logs = [folder / "drive.tlog", folder / "drive.log"]
+    line = wrong.read_text().splitlines().index('unit = "m/s"') + 1
+    figures = tmp_path / "summary.json"
+    for command in ("doctor", "replay"):
+        code, out, _ = run(command, wrong, *logs, "--json", figures)
+        assert code == CONTRADICTED
+        assert "times the speed by GNSS: is the unit km/h, not m/s?" in out
+        assert f'wrong.toml:{line}: wheel.front_left.unit = "km/h"' in out
+        (finding,) = msgspec.json.decode(figures.read_bytes(), type=Summary).findings
+        assert (finding.kind, finding.key) == ("wheel_unit", "wheel.front_left.unit")
+    code, out, err = run("doctor", folder / "fusiond.toml", *logs)
+    assert (code, err) == (SUCCESS, "")
+    assert "s of data contradict nothing" in out
+    assert run("doctor", "-q", folder / "fusiond.toml", *logs) == (SUCCESS, "", "")
+
+
+def test_a_replay_without_a_state_says_why(run: Run, folder: Path) -> None:
+    code, out, _ = run("replay", folder / "fusiond.toml", folder / "drive.log")
+    assert code == NO_STATE
+    assert "final state    none: no log of mavlink.fcu is given" in out
+
+
 # --- Errors
 
 
@@ -426,7 +454,7 @@ def test_interleaved_logs(replay: Run, folder: Path, tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(mixed)
         figures = tmp_path / "summary.json"
         code, _, err = replay(tmp_path / name, "--json", figures)
-        assert (code, err) == (SUCCESS, "")
+        assert (code, err) == (SUCCESS if name == "mixed.tlog" else NO_STATE, "")
         met = msgspec.json.decode(figures.read_bytes(), type=Summary).logs[name]
         assert met.keys() & {"bad bytes", "bad lines"}
 
@@ -440,7 +468,7 @@ def test_logs_swapped_or_unusable(replay: Run, folder: Path, tmp_path: Path) -> 
     other = tmp_path / "other.log"
     other.write_text("(1760000000.000000) can0 123#00\n")
     code, _, err = replay(other)
-    assert code == UNUSABLE
+    assert code == NO_STATE
     assert "nothing in the logs that the configuration asks for" in err
     assert replay(tmp_path / "absent.tlog")[0] == UNUSABLE
 
