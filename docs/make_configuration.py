@@ -107,7 +107,20 @@ def _rows(table: Table) -> Iterator[tuple[str, str, str, str, str]]:
 
 
 def _comments(struct: type[Section]) -> dict[str, str]:
-    """The trailing comment of every field. KeyError where one has none."""
+    """The trailing comment of every field, inherited ones too. KeyError where one has none."""
+    found: dict[str, str] = {}
+    for kind in reversed(struct.__mro__):
+        if issubclass(kind, Section):
+            found |= _own_comments(kind)
+    wanted = {field.name for field in msgspec.structs.fields(struct) if not _section(field.type)[0]}
+    silent = sorted(name for name in wanted if not UNIT.sub("", found.get(name, "")))
+    if silent:
+        raise KeyError(f"{struct.__name__}: a trailing comment is missing: {', '.join(silent)}")
+    return {name: found[name] for name in wanted}
+
+
+def _own_comments(struct: type[Section]) -> dict[str, str]:
+    """The trailing comments of the fields that a struct itself defines."""
     lines = inspect.getsource(struct).splitlines(keepends=True)
     tokens = tokenize.generate_tokens(iter(lines).__next__)
     by_line = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
@@ -118,11 +131,7 @@ def _comments(struct: type[Section]) -> dict[str, str]:
         for node in tree.body
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
     }
-    wanted = {field.name for field in msgspec.structs.fields(struct) if not _section(field.type)[0]}
-    silent = sorted(name for name in wanted if not UNIT.sub("", by_line.get(fields[name], "")))
-    if silent:
-        raise KeyError(f"{struct.__name__}: a trailing comment is missing: {', '.join(silent)}")
-    return {name: by_line[fields[name]] for name in wanted}
+    return {name: by_line[line] for name, line in fields.items() if line in by_line}
 
 
 def _defaults(field: msgspec.structs.FieldInfo, instances: dict[str, Any]) -> str:

@@ -53,6 +53,7 @@ class WheelSpeed(Struct, frozen=True, gc=False):
 
     speed: float  # m/s
     sigma: float = 0.0  # m/s, one standard deviation of this reading, on top of what the configuration says
+    signed: bool = False  # its direction is known, though the wheel's own signal does not give it
 
 
 class Pressure(Struct, frozen=True, gc=False):
@@ -79,7 +80,32 @@ class Invalid(Struct, frozen=True, gc=False):
     reason: str
 
 
-Payload = ImuSample | GnssPosition | GnssVelocity | GnssYaw | WheelSpeed | Pressure
+class YawRate(Struct, frozen=True, gc=False):
+    """The car's own yaw rate, about the vehicle's vertical axis."""
+
+    rate: float  # rad/s, clockwise
+
+
+class SteeringAngle(Struct, frozen=True, gc=False):
+    """Where the road wheels of the steered axle point, by the steering wheel."""
+
+    angle: float  # rad, of the road wheels, clockwise: to the right
+
+
+class LateralAcceleration(Struct, frozen=True, gc=False):
+    """The car's own accelerometer across it."""
+
+    specific_force: float  # m/s^2, to the right
+
+
+class Parked(Struct, frozen=True, gc=False):
+    """Whether the gear lever is at park, or the handbrake is on."""
+
+    parked: bool
+
+
+CarPayload = YawRate | SteeringAngle | LateralAcceleration | Parked
+Payload = ImuSample | GnssPosition | GnssVelocity | GnssYaw | WheelSpeed | Pressure | CarPayload
 AnyPayload = Payload | ClockPair | Invalid
 
 
@@ -101,13 +127,15 @@ class Received(Struct, frozen=True, gc=False):
 
 
 class Measurement(Struct, frozen=True, gc=False):
-    """A payload placed on the time line: it was measured at `t_ns`. The order of events is `key`."""
+    """A payload placed on the time line: it was measured at `t_ns`. The order of events is `key`. `stamp_sigma` is how far
+    off the alignment of clocks may have placed it against the inertial sensor's samples [s]."""
 
     t_ns: int
     source: str
     sequence: int
     t_receive_ns: int
     payload: Payload | Invalid
+    stamp_sigma: float = 0.0
 
     @property
     def key(self) -> tuple[int, str, int]:

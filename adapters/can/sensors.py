@@ -14,10 +14,24 @@ from typing import Any, Protocol, TypeVar
 
 from cantools.database.can import Message, Signal
 
+from fusiond.config.car import CarSensor, LateralAccelerometer, ParkedSensor, Steering, YawRateSensor
 from fusiond.config.schema import Checksum, ConfiguredSensor, Gnss, Imu, Wheel
 from fusiond.config.sensor import Sensor, split_signal
 from fusiond.config.toml import ConfigError
-from fusiond.events import FIX_3D, AnyPayload, GnssVelocity, ImuSample, Invalid, Received, Vector3, WheelSpeed
+from fusiond.events import (
+    FIX_3D,
+    AnyPayload,
+    GnssVelocity,
+    ImuSample,
+    Invalid,
+    LateralAcceleration,
+    Parked,
+    Received,
+    SteeringAngle,
+    Vector3,
+    WheelSpeed,
+    YawRate,
+)
 from fusiond.units import MICROSECOND, SECOND
 from fusiond_adapters.payloads import InertialAxes, gnss_position, velocity_by_course
 
@@ -35,6 +49,8 @@ DBC_UNITS = {  # as DBC files write them, in lower case: as the configuration do
 PER_RADIUS = {"rad/s": 1.0, "rpm": 2 * math.pi / 60}  # times the radius in metres
 ACCELERATIONS = {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3}  # m/s^2
 RATES = {"rad/s": 1.0, "deg/s": math.pi / 180}  # rad/s
+ANGLES = {"rad": 1.0, "deg": math.pi / 180}  # rad
+DIRECTION_NS = 2 * SECOND  # a direction that another frame told longer ago is not known any more
 J1939_VALID_TOP = 0xFA  # largest top byte of a valid J1939 value
 TOGETHER = 0.5  # of the interval: messages of one sample come within this
 
@@ -63,12 +79,16 @@ class WheelReader:
         self._name, self._wheel, self._event = name, wheel, event
         self._factor = _factor(wheel)
         self._signal = wheel.signal or ""
+        elsewhere = wheel.direction_signal is not None and "." in wheel.direction_signal
+        self._direction = None if elsewhere else wheel.direction_signal
+        self._tells = elsewhere or wheel.forward_values is not None  # only at times
+        self._heard: tuple[float, int] | None = None  # what another frame said of the direction, and when
         signals = {signal.name: signal for signal in message.signals}
         for key in ("signal", "direction_signal", "valid_signal", "counter_signal", "base_signal"):
             wanted = getattr(wheel, key)
-            if wanted is not None:
+            if wanted is not None and not (key == "direction_signal" and elsewhere):
                 find(wanted, signals, f"wheel.{name}.{key}", f"signal of {message.name}")
-        guards = (wheel.direction_signal, wheel.valid_signal, wheel.counter_signal, wheel.base_signal)
+        guards = (self._direction, wheel.valid_signal, wheel.counter_signal, wheel.base_signal)
         self.needed = [self._signal, *(guard for guard in guards if guard is not None)]
         self._counter: float | None = None  # last value of counter_signal
         speeds = [signals[speed] for speed in (self._signal, wheel.base_signal) if speed is not None]
@@ -76,12 +96,31 @@ class WheelReader:
         self.warnings = list(_unit_warnings(name, wheel, speeds))
 
     def events(self, signals: Mapping[str, float], t_receive_ns: int) -> list[Received]:
-        return [self._event(self._name, NO_STAMP, t_receive_ns, self._payload(signals))]
+        return [self._event(self._name, NO_STAMP, t_receive_ns, self._payload(signals, t_receive_ns))]
 
     def invalid(self, reason: str, t_receive_ns: int) -> list[Received]:
         return [self._event(self._name, NO_STAMP, t_receive_ns, Invalid(reason))]
 
-    def _payload(self, signals: Mapping[str, float]) -> WheelSpeed | Invalid:
+    def hear(self, direction: float, t_receive_ns: int) -> None:
+        """Take what another frame says of the direction."""
+        self._heard = direction, t_receive_ns
+
+    def _sign(self, signals: Mapping[str, float], t_receive_ns: int) -> int:
+        """The direction: 1 forwards, -1 backwards, 0 unknown."""
+        wheel = self._wheel
+        if wheel.direction_signal is None:
+            return 0
+        if self._direction is not None:
+            value = signals[self._direction]
+        elif self._heard is None or t_receive_ns - self._heard[1] > DIRECTION_NS:
+            return 0
+        else:
+            value = self._heard[0]
+        if value == wheel.reverse_value:
+            return -1
+        return int(wheel.forward_values is None or value in wheel.forward_values)
+
+    def _payload(self, signals: Mapping[str, float], t_receive_ns: int) -> WheelSpeed | Invalid:
         """The speed, if the other signals say that it is valid."""
         wheel = self._wheel
         if wheel.counter_signal is not None:
@@ -99,9 +138,26 @@ class WheelReader:
         speed = value * self._factor
         if not math.isfinite(speed):
             return Invalid("not finite")
-        if wheel.direction_signal is not None and signals[wheel.direction_signal] == wheel.reverse_value:
-            speed = -speed
-        return WheelSpeed(speed)
+        sign = self._sign(signals, t_receive_ns)
+        return WheelSpeed(-speed if sign < 0 else speed, signed=self._tells and sign != 0)
+
+
+class _DirectionReader:
+    """The message that tells the direction of a wheel whose own message does not."""
+
+    def __init__(self, message: Message, signal: str, wheel: WheelReader) -> None:
+        self.message = message
+        self.checksum: Checksum | None = None
+        self.needed = [signal]
+        self.warnings: list[str] = []
+        self._signal, self._wheel = signal, wheel
+
+    def events(self, signals: Mapping[str, float], t_receive_ns: int) -> list[Received]:
+        self._wheel.hear(signals[self._signal], t_receive_ns)
+        return []
+
+    def invalid(self, reason: str, t_receive_ns: int) -> list[Received]:
+        return []
 
 
 class _Sample:
@@ -289,7 +345,47 @@ def _scaled(values: Mapping[str, float], signals: tuple[str, ...], factor: float
     return x, y, z
 
 
-SENSORS: dict[type[Sensor], Callable[[str, Any, str, MakeEvent], _Signals]] = {Imu: ImuSignals, Gnss: GnssSignals}
+class CarSignals:
+    """One of the car's own sensors: a signal to its payload."""
+
+    def __init__(self, name: str, sensor: CarSensor, _bus: str, event: MakeEvent) -> None:
+        self.values: dict[str, float] = {}
+        self._name, self._sensor, self._event = name, sensor, event
+        self._message = split_signal(sensor.signal)[0]
+
+    def events(self, message: str, t_receive_ns: int) -> list[Received]:
+        if message != self._message:
+            return []
+        return [self._event(self._name, NO_STAMP, t_receive_ns, self._payload())]
+
+    def invalid(self, message: str, reason: str, t_receive_ns: int) -> list[Received]:
+        return [self._event(self._name, NO_STAMP, t_receive_ns, Invalid(reason))] if message == self._message else []
+
+    def _payload(self) -> AnyPayload:
+        sensor, value = self._sensor, self.values[self._sensor.signal]
+        if sensor.valid_signal is not None and self.values.get(sensor.valid_signal) != sensor.valid_value:
+            return Invalid("valid_signal")
+        if not math.isfinite(value):
+            return Invalid("not finite")
+        if isinstance(sensor, ParkedSensor):
+            return Parked(value in sensor.values)
+        assert isinstance(sensor, YawRateSensor | Steering | LateralAccelerometer)
+        value = (value - sensor.zero) * sensor.scale
+        if isinstance(sensor, YawRateSensor):
+            return YawRate(value * RATES[sensor.unit])
+        if isinstance(sensor, Steering):
+            return SteeringAngle(value * ANGLES[sensor.unit] / sensor.ratio)
+        return LateralAcceleration(value * ACCELERATIONS[sensor.unit])
+
+
+SENSORS: dict[type[Sensor], Callable[[str, Any, str, MakeEvent], _Signals]] = {
+    Imu: ImuSignals,
+    Gnss: GnssSignals,
+    YawRateSensor: CarSignals,
+    Steering: CarSignals,
+    LateralAccelerometer: CarSignals,
+    ParkedSensor: CarSignals,
+}
 
 
 def readers(
@@ -303,18 +399,27 @@ def readers(
     table, name, section = configured
     if isinstance(section, Wheel):
         message = find(section.message or "", messages, f"{table}.{name}.message", "message")
-        yield WheelReader(name, section, message, event, j1939=j1939(message))
+        wheel = WheelReader(name, section, message, event, j1939=j1939(message))
+        yield wheel
+        if section.direction_signal is not None and "." in section.direction_signal:
+            yield _DirectionReader(*_found(section.direction_signal, messages, f"{table}.{name}"), wheel)
         return
-    assert isinstance(section, Imu | Gnss), "no other sensor comes by bus"
+    assert isinstance(section, Imu | Gnss | CarSensor), "no other sensor comes by bus"
     sensor = SENSORS[type(section)](name, section, bus, event)
     wanted: dict[str, list[str]] = {}
     for signal in section.signals():
-        message_name, own = split_signal(signal)
-        message = find(message_name, messages, f"{table}.{name}: {signal}", "message")
-        find(own, {one.name: one for one in message.signals}, f"{table}.{name}: {signal}", f"signal of {message_name}")
-        wanted.setdefault(message_name, []).append(own)
+        message, own = _found(signal, messages, f"{table}.{name}")
+        wanted.setdefault(message.name, []).append(own)
     for message_name, signals in wanted.items():
         yield _SignalReader(messages[message_name], dict.fromkeys(signals), sensor)
+
+
+def _found(signal: str, messages: Mapping[str, Message], key: str) -> tuple[Message, str]:
+    """The message of MESSAGE.SIGNAL, and the signal's own name. Raises ConfigError where the DBC lacks one."""
+    message_name, own = split_signal(signal)
+    message = find(message_name, messages, f"{key}: {signal}", "message")
+    find(own, {one.name: one for one in message.signals}, f"{key}: {signal}", f"signal of {message_name}")
+    return message, own
 
 
 def _limits(speeds: list[Signal], given: int | None, j1939: bool) -> Iterator[tuple[str, int, float]]:

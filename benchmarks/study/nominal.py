@@ -68,6 +68,9 @@ def config(wheels: dict[str, dict[str, Any]] | None = None, **changes: dict[str,
         "gnss": {"gps0": {"link": "link"} | tables["gnss"]},
         "wheel": {name: wheel | own for name, own in (WHEELS if wheels is None else wheels).items()},
     }
+    for table in ("yaw_rate", "steering"):  # the car's own sensors are only there where they are asked for
+        if table in changes:
+            raw[table] = {table: {"bus": "bus", "signal": "m.s"} | changes[table]}
     return msgspec.convert(raw, Config)
 
 

@@ -15,9 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.config.schema import Config, Wheel, wheel_groups
-from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, Payload, WheelSpeed
+from fusiond.events import (
+    GnssPosition,
+    GnssVelocity,
+    ImuSample,
+    Measurement,
+    Payload,
+    SteeringAngle,
+    WheelSpeed,
+    YawRate,
+)
 from fusiond.filter.parameters import make_parameters, scale_state
-from fusiond.filter.state import ANTENNA_ERROR, CALIBRATIONS, DELAYS_ERROR, MOUNT_ERROR, WIDE_SIZE
+from fusiond.filter.state import (
+    ANTENNA_ERROR,
+    CALIBRATIONS,
+    DELAYS_ERROR,
+    MOUNT_ERROR,
+    STEERING_FACTOR_ERROR,
+    STEERING_OFFSET_ERROR,
+    UNDERSTEER_ERROR,
+    WIDE_SIZE,
+    YAW_RATE_OFFSET_ERROR,
+)
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import ECCENTRICITY2
 from fusiond.simulation import imu as inertial_sensor
@@ -163,6 +182,14 @@ class World:
         """Regular instants inside the drive [s]."""
         return np.asarray(phase + interval * np.arange(int((self.t[-1] - phase) / interval + 1e-6) + 1))
 
+    def turn_rate(self, t: Array) -> Array:
+        """Turn rate (N,) [rad/s] about the vehicle's vertical axis."""
+        return np.asarray((self.kinematics(t).rate_nb_b @ self.trajectory.mat_vb.T)[:, 2])
+
+    def axle_speed(self, t: Array) -> Array:
+        """Forward speed (N,) [m/s] of the middle of the unsteered axle."""
+        return self.wheel_speed(Wheel(position_m=self.config.motion.point_m), t)
+
     def wheel_speed(self, wheel: Wheel, t: Array) -> Array:
         """True speed (N,) [m/s] of a wheel's circumference, scale left out."""
         kinematics = self.kinematics(t)
@@ -238,8 +265,36 @@ class Sensors:
                 readings = self._spoilt(fault, t, readings, wheel.sigma_mps)
             signal = np.abs(readings) if wheel.unsigned else readings
             self._add(found, name, t, [WheelSpeed(v) for v in signal.tolist()], 0.0)
+        self._car(found)
         found.sort(key=lambda m: (m.t_receive_ns, m.t_ns, m.source))
         return found
+
+    def _car(self, found: list[Measurement]) -> None:
+        """The car's own yaw rate and steering, where they are configured, at the rate of the wheels."""
+        world = self.world
+        t = world.times(1 / self.wheel_hz, 2 * WHEEL_PHASE_S)
+        turn, speed = world.turn_rate(t), world.axle_speed(t)
+        for name, yaw in self.config.yaw_rate.items():
+            noise = self._noise(len(t), 1 / self.wheel_hz, yaw.correlation_s)[:, 0]
+            readings = turn + self._drawn(YAW_RATE_OFFSET_ERROR) + np.radians(yaw.sigma_deg_s) * noise
+            for fault in self._of(name):
+                readings = self._spoilt(fault, t, readings, float(np.radians(yaw.sigma_deg_s)))
+            self._add(found, name, t, [YawRate(rate) for rate in readings.tolist()], 0.0)
+        for name, steering in self.config.steering.items():
+            noise = self._noise(len(t), 1 / self.wheel_hz, steering.correlation_s)[:, 0]
+            moving = np.abs(speed) > steering.minimum_speed_mps / 2
+            needed = np.where(moving, steering.wheelbase_m / np.where(moving, speed, 1.0), 0.0)
+            needed += self._drawn(UNDERSTEER_ERROR) * speed
+            sigma = float(np.radians(steering.sigma_deg) / steering.ratio)
+            angles = self._drawn(STEERING_OFFSET_ERROR) + (1 + self._drawn(STEERING_FACTOR_ERROR)) * needed * turn
+            angles += sigma * noise
+            for fault in self._of(name):
+                angles = self._spoilt(fault, t, angles, sigma)
+            self._add(found, name, t, [SteeringAngle(angle) for angle in np.clip(angles, -1.5, 1.5).tolist()], 0.0)
+
+    def _drawn(self, state: slice) -> float:
+        """The true value of a calibration."""
+        return float(self.world.drawn.calibrations[state.start - CALIBRATIONS])
 
     def _noise(self, count: int, interval: float, correlation: float) -> Array:
         """Noise (count, 3) of unit variance with a correlation time [s]; white for 0."""

@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, get_args, get_origi
 from msgspec import Meta, field
 
 from fusiond import events
+from fusiond.config.car import LateralAccelerometer, ParkedSensor, Steering, YawRateSensor
 from fusiond.config.outputs import Autopilot, Foxglove, GroundStation, Mcap, Prometheus, Publish, Record, Ros2, Zenoh
 from fusiond.config.sensor import (
     INERTIAL,
@@ -32,7 +33,9 @@ Span = Annotated[float, Meta(ge=0, le=1_000_000)]  # s
 Milliseconds = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 WHEEL_DISTANCE = "WHEEL_DISTANCE"  # the MAVLink message of all wheels
 CAN_KEYS = ("message", "signal")  # of a wheel that comes by CAN
-GUARD_KEYS = ("direction_signal", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal")
+GUARD_KEYS = (
+    "direction_signal", "forward_values", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal",
+)  # fmt: skip
 STAMPS = {"sensor": "by its own stamp", "arrival": "by its arrival"}
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 SpeedUnit = Literal["m/s", "km/h", "mph", "kn"]
@@ -423,8 +426,9 @@ class Wheel(Sensor, frozen=True, kw_only=True):
     radius_m: Positive | None = None  # rolling radius
     scale: float = 1.0  # known factor on the signal; negative if its sign is reversed
     unsigned: bool = True  # the signal has no sign: it does not give the direction
-    direction_signal: str | None = None  # a signal whose value reverse_value means driving backwards
+    direction_signal: str | None = None  # a signal, also MESSAGE.SIGNAL of another frame, that tells the direction or gear
     reverse_value: int = 1  # what direction_signal reads when driving backwards
+    forward_values: list[int] | None = None  # and when driving forwards; with others it is unknown; default: all others
     valid_signal: str | None = None  # a signal that must equal valid_value
     valid_value: int = 0  # what valid_signal must read
     counter_signal: str | None = None  # a rolling counter; a repeated value means a stale frame
@@ -558,6 +562,10 @@ class Config(Section, frozen=True, kw_only=True):
     wheel: dict[Name, Wheel] = field(default_factory=dict)
     barometer: dict[Name, Barometer] = field(default_factory=dict)
     dual_antenna: dict[Name, DualAntenna] = field(default_factory=dict)
+    yaw_rate: dict[Name, YawRateSensor] = field(default_factory=dict)
+    steering: dict[Name, Steering] = field(default_factory=dict)
+    lateral_acceleration: dict[Name, LateralAccelerometer] = field(default_factory=dict)
+    parked: dict[Name, ParkedSensor] = field(default_factory=dict)
     directory: str = "."  # set on loading: where relative file names start
 
     def path(self, name: str) -> Path:

@@ -17,7 +17,7 @@ from fusiond.filter.hot_start import is_confirmed, leading, leads
 from fusiond.filter.kernel.interpreted import AnyKernel
 from fusiond.filter.north_east_down import COVARIANCE_N, QUATERNION_NB, VELOCITY_N
 from fusiond.filter.observations import IMU, MODELS
-from fusiond.filter.observations.model import Unusable, within
+from fusiond.filter.observations.model import STAMP_ERROR, Unusable, within
 from fusiond.filter.parameters import make_parameters, model_of
 from fusiond.filter.rivals import probability_of_lie
 from fusiond.filter.rows import Outcome
@@ -184,6 +184,8 @@ class Fusion:
         values = to_values(payload, section)
         if not math.isfinite(sum(values)):
             raise Unusable("not finite")
+        if measurement.stamp_sigma > 0:
+            values += (0.0,) * (STAMP_ERROR - len(values)) + (measurement.stamp_sigma,)
         return values
 
     def _published(self, state: FilterState) -> FilterState:

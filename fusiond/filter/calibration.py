@@ -16,6 +16,10 @@ from fusiond.filter.state import (
     MOUNT_ERROR,
     SCALE,
     SLIP_ERROR,
+    STEERING_FACTOR_ERROR,
+    STEERING_OFFSET_ERROR,
+    UNDERSTEER_ERROR,
+    YAW_RATE_OFFSET_ERROR,
     FilterState,
 )
 
@@ -58,3 +62,7 @@ def _names(params: Parameters) -> Iterator[tuple[int, str, float]]:
     yield INERTIAL_DELAYS_ERROR.start, "gyro_delay_ms", MS_PER_S
     yield INERTIAL_DELAYS_ERROR.start + 1, "accel_delay_ms", MS_PER_S
     yield SLIP_ERROR.start, "slip_deg_per_mps2", DEGREE
+    yield YAW_RATE_OFFSET_ERROR.start, "yaw_rate_offset_deg_s", DEGREE
+    yield STEERING_OFFSET_ERROR.start, "steering_offset_deg", DEGREE
+    yield STEERING_FACTOR_ERROR.start, "steering_factor", 1.0
+    yield UNDERSTEER_ERROR.start, "understeer_deg_per_mps2", DEGREE

@@ -10,8 +10,26 @@ import numpy as np
 from fusiond.config.schema import Config, Filter, Imu, Source, calibrated, wheel_groups
 from fusiond.config.sensor import INERTIAL, Stream
 from fusiond.filter.measurement_update import correlation_factor
-from fusiond.filter.observations import CONSTRAINTS, GNSS_VELOCITY, IMU, MODEL, MODELS, WHEEL_SPEED, wheel_speed
-from fusiond.filter.observations.model import CLUTTER, COMPANION, CORRELATION, NOISE_MAX, NOISE_MIN, SHARED, empty_row
+from fusiond.filter.observations import (
+    CONSTRAINTS,
+    GNSS_VELOCITY,
+    IMU,
+    MODEL,
+    MODELS,
+    ON_AXLE,
+    WHEEL_SPEED,
+    wheel_speed,
+)
+from fusiond.filter.observations.model import (
+    CLUTTER,
+    COMPANION,
+    CORRELATION,
+    LEVER_ARM_B,
+    NOISE_MAX,
+    NOISE_MIN,
+    SHARED,
+    empty_row,
+)
 from fusiond.filter.state import (
     ANTENNA_ERROR,
     CALIBRATIONS,
@@ -23,7 +41,11 @@ from fusiond.filter.state import (
     MOUNT_ERROR,
     SCALE,
     SLIP_ERROR,
+    STEERING_FACTOR_ERROR,
+    STEERING_OFFSET_ERROR,
+    UNDERSTEER_ERROR,
     WIDE_SIZE,
+    YAW_RATE_OFFSET_ERROR,
 )
 from fusiond.filter.stored_state import StoredState
 from fusiond.filter.strapdown import ProcessNoise
@@ -139,6 +161,8 @@ def _parameters(source: str, sources: tuple[str, ...], config: Config, streams: 
         row[SENSOR_AXES] = matrix_from_euler(*(math.radians(angle) for angle in imu.rotation_deg)).ravel()
         return row
     row = MODELS[model].parameters(section)
+    if model in ON_AXLE:
+        row[LEVER_ARM_B] = config.motion.point_m
     row[CORRELATION] = stream.correlation_s
     row[NOISE_MIN], row[NOISE_MAX] = square(stream.noise_min), square(stream.noise_max)
     row[SHARED] = _shared(table, stream, streams)
@@ -193,5 +217,13 @@ def _calibrations(config: Config) -> tuple[Array, Array]:
         first[INERTIAL_DELAYS_ERROR] = square(imu.delay_sigma_ms * 1e-3)
         if imu.delay_sigma_ms and config.motion.non_holonomic:
             first[SLIP_ERROR] = square(math.radians(config.motion.slip_sigma_deg_per_mps2))
-    size = WIDE_SIZE if first[ERROR_SIZE:].any() else ERROR_SIZE
+    for sensor in config.yaw_rate.values():
+        first[YAW_RATE_OFFSET_ERROR] = square(math.radians(sensor.offset_sigma_deg_s))
+        walks[YAW_RATE_OFFSET_ERROR] = square(math.radians(sensor.offset_walk_deg_s)) if sensor.offset_sigma_deg_s else 0.0
+    for steering in config.steering.values():
+        first[STEERING_OFFSET_ERROR] = square(math.radians(steering.offset_sigma_deg) / steering.ratio)
+        first[STEERING_FACTOR_ERROR] = square(steering.factor_sigma)
+        first[UNDERSTEER_ERROR] = square(math.radians(steering.understeer_sigma_deg_per_mps2))
+    wide = first[ERROR_SIZE:].any() or config.yaw_rate or config.steering
+    size = WIDE_SIZE if wide else ERROR_SIZE
     return first[CALIBRATIONS:size], walks[CALIBRATIONS:size]

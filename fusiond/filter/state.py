@@ -59,6 +59,10 @@ DELAYS, DELAYS_ERROR = _state(2)  # s, what the position's delay is more than co
 HEIGHT_OFFSET, HEIGHT_OFFSET_ERROR = _state(1)  # m, how much too high the barometer reads
 INERTIAL_DELAYS, INERTIAL_DELAYS_ERROR = _state(2)  # s, what the delays of gyro and accelerometer are more than configured
 SLIP, SLIP_ERROR = _state(1)  # rad per m/s^2: slip angle of the unsteered axle in a bend, out of it
+YAW_RATE_OFFSET, YAW_RATE_OFFSET_ERROR = _state(1)  # rad/s, how much too high the car's own yaw rate reads
+STEERING_OFFSET, STEERING_OFFSET_ERROR = _state(1)  # rad, of the road wheels, how much too far right they are said to point
+STEERING_FACTOR, STEERING_FACTOR_ERROR = _state(1)  # 1: how much too large that is in proportion
+UNDERSTEER, UNDERSTEER_ERROR = _state(1)  # rad per m/s^2, by which the road wheels point further into a bend than it needs
 INERTIAL_DOUBT = _nominal.one()  # 0..1: how much process noise a lie of the inertial sensor still adds; it fades
 NOMINAL_SIZE, WIDE_SIZE = _nominal.size, _error.size
 

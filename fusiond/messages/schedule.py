@@ -199,6 +199,7 @@ class Changes:
         self._awaited = set(fusion.params.sources)  # never present yet
         self._statuses = dict.fromkeys(fusion.params.sources, "nominal")
         self._unusable: frozenset[str] = frozenset()
+        self._clock_faults: dict[str, int] = {}
         self._next_status_ns: int = NEVER
 
     def begin_session(self) -> None:
@@ -245,6 +246,10 @@ class Changes:
             for name in sorted(self._unusable - unusable):
                 yield event(kind="clock", severity="info", subject=name, text=f"clock {name}: of use again")
             self._unusable = unusable
+            for name in sorted(name for name, report in clocks.items() if report.faults > self._clock_faults.get(name, 0)):
+                text = f"clock {name}: {clocks[name].note or 'the bounds of its offset contradicted each other'}"
+                yield event(kind="clock", severity="warning", subject=name, text=text)
+            self._clock_faults = {name: report.faults for name, report in clocks.items()}
 
     def _reason(self) -> str:
         """The reason of the last reset, in words."""
@@ -295,4 +300,10 @@ def _clock_health(name: str | None, clocks: Mapping[str, ClockReport]) -> ClockH
         resets=report.resets,
         strays=report.strays,
         note=report.note,
+        bounds_ms=None if report.bounds_ns is None else _milliseconds(report.bounds_ns),
+        faults=report.faults,
     )
+
+
+def _milliseconds(bounds_ns: tuple[int, int]) -> tuple[float, float]:
+    return bounds_ns[0] / MILLISECOND, bounds_ns[1] / MILLISECOND

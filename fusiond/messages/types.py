@@ -168,6 +168,10 @@ class ClockHealth(Message, frozen=True, kw_only=True):
     resets: Annotated[int, _about("re-alignments after a jump or a reboot")]
     strays: Annotated[int, _about("implausible stamps")]
     note: Annotated[str, _about("why no better method is in use")] = ""
+    bounds_ms: Annotated[
+        tuple[float, float] | None, _about("between which the offset lies for certain, by TIMESYNC and receipts [ms]")
+    ] = None
+    faults: Annotated[int, _about("how often these bounds contradicted each other: a clock has moved")] = 0
 
 
 class Probabilities(Message, frozen=True, kw_only=True):

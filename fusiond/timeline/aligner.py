@@ -56,6 +56,8 @@ PIECE = 50 * MILLISECOND  # minimum length of a linear piece of the shift
 PIECES = 256  # pieces kept for old stamps: 6 s and more
 STEP = 250 * MILLISECOND  # if the aim is farther off than this, and than slewing reaches, the shift steps: a re-alignment
 
+EMPTY = 5 * MILLISECOND  # bounds that contradict each other by more are a fault; less is drift that was not learnt yet
+
 UNUSABLE = "its clock drifts too fast"
 
 Method = Literal["arrival", "unix", "timesync", "system_time", "least_offset"]
@@ -73,6 +75,8 @@ class ClockReport:
     strays: int  # stamps that were invalid
     samples: int
     note: str = ""
+    bounds_ns: tuple[int, int] | None = None  # of the offset, by round trips and receipts, latest
+    faults: int = 0  # how often these contradicted each other, so that nothing lay between them
     usable: bool = True  # False: it drifts by more than a crystal can, and its stamps are invalid
 
 
@@ -130,7 +134,7 @@ class Aligner:
     """Places the stamps of one clock. `unix` is the aligner of the Unix clock; None for the Unix clock itself."""
 
     def __init__(self, unix: Aligner | None) -> None:
-        self.samples = self.resets = self.strays = 0
+        self.samples = self.resets = self.strays = self.faults = 0
         self.complaint = ""  # why a better method is not in use
         self._unix = unix
         self._pieces: deque[_Piece] = deque(maxlen=PIECES)
@@ -153,8 +157,11 @@ class Aligner:
         self._pairs: OffsetFloor | None = None  # unix less boot
         self._odd_pair: int | None = None
         self._trips = RoundTrips()
+        self._bounds: tuple[int, int] | None = None  # of the offset, by the last round trip
+        self._contradicted = False  # by the last round trip
         self.synchronised = False  # by round trips
         self.bridge: int | None = None  # for the Unix clock: its offset, by way of a synchronised boot clock
+        self.bridge_half_width = 0  # ns, of the bounds of that offset
         self.trusted = self._unix is None and -FUTURE_TOLERANCE <= offset <= PLAUSIBLE_LATENCY  # boot: see learn_pair
         self._restart(_Piece(stamp, stamp, self._aim(receive)), stamp)
 
@@ -325,7 +332,11 @@ class Aligner:
         self._trips.add(stamp, sent, receive)
         floor = self._floor.at(receive)
         if (bounds := self._trips.bounds(receive, floor)) is not None:
-            least, most = bounds
+            if bounds[0] - bounds[1] > EMPTY:
+                bounds = self._begin_trips(bounds, stamp, sent, receive)
+            else:
+                self._contradicted = False
+            least, most = self._bounds = bounds
             future, uncertainty = (least + most) // 2 - floor, (most - least) // 2
             plausible = -PLAUSIBLE_LATENCY <= future <= FUTURE_TOLERANCE // (1 if self.synchronised else 2)
             self.synchronised = plausible and uncertainty <= STEP
@@ -334,6 +345,28 @@ class Aligner:
             elif not self.synchronised:
                 self.complaint = f"TIMESYNC is uncertain by {uncertainty // MILLISECOND} ms"
 
+    def _begin_trips(self, bounds: tuple[int, int], stamp: int, sent: int, receive: int) -> tuple[int, int]:
+        """Count bounds that contradict each other as a fault, and begin anew with the last round trip: one of the two clocks
+        has moved. Returns the new bounds; those of the trip alone, where receipts contradict even these."""
+        self.faults += not self._contradicted
+        self._contradicted = True
+        self.complaint = f"the bounds of its offset contradict each other by {(bounds[0] - bounds[1]) / MILLISECOND:.0f} ms"
+        self._trips = RoundTrips()
+        self._trips.add(stamp, sent, receive)
+        anew = self._trips.bounds(receive, self._floor.at(receive))
+        return anew if anew is not None and anew[0] <= anew[1] else (sent - stamp, receive - stamp)
+
+    @property
+    def half_width(self) -> int:
+        """Of the bounds between which the offset in use lies [ns]; 0 where there are none."""
+        if not self._pieces:
+            return 0
+        if self.bridge is not None:
+            return self.bridge_half_width
+        if not self.synchronised or self._bounds is None:
+            return 0
+        return max(0, self._bounds[1] - self._bounds[0]) // 2
+
     def bridge_to(self, unix: Aligner, receive: int) -> None:
         """Set the Unix clock's offset from the host's, if this clock's offset from both is known."""
         offset = self._tripped(receive) if self._pieces and self.synchronised and self._pairs else None
@@ -341,6 +374,7 @@ class Aligner:
             bridge = offset - self._pairs.at(receive)
             plausible = -STEP <= bridge - unix.floor_at(receive) <= FUTURE_TOLERANCE
             unix.bridge = bridge if plausible else None
+            unix.bridge_half_width = self.half_width
 
     @property
     def drift(self) -> int | None:
@@ -366,4 +400,7 @@ class Aligner:
         if self.drift is not None:
             drift, speed = self.drift, 1 - self.drift / BILLION
             note = f"unusable: it runs {speed:.4f} times as fast as the host's; {LIMIT // 1000} ppm are possible"
-        return ClockReport(method, offset, drift / 1e3, jitter, self.resets, self.strays, self.samples, note, usable)
+        bounds = self._bounds if self._pieces and self.synchronised else None
+        return ClockReport(
+            method, offset, drift / 1e3, jitter, self.resets, self.strays, self.samples, note, bounds, self.faults, usable
+        )

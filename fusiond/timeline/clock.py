@@ -3,14 +3,20 @@
 A stamp is t = aligned stamp - the source's delay; without a stamp, t = receipt - delay. Every clock that sensors stamp
 with (`Received.clock`) has one `Aligner`, shared by all sources that read it, so that the quickest message serves them
 all. Invalid payloads are stamped, but nothing is learnt from them.
+
+Round trips leave the offset of a clock between two bounds (THEORY A6). An event of another clock than the inertial
+sensor's is told how far off its samples it may lie: errors that both clocks share do not count.
 """
 
 from __future__ import annotations
+
+import math
 
 from fusiond.config.schema import Config
 from fusiond.events import HOST_CLOCK, UNIX_CLOCK, ClockPair, Invalid, Measurement, Received
 from fusiond.sessions import Receipts
 from fusiond.timeline.aligner import Aligner, ClockReport
+from fusiond.units import SECOND
 
 ABSURD = "sensor stamp is not positive"
 
@@ -23,6 +29,7 @@ class Clock:
         self._aligners = {UNIX_CLOCK: Aligner(None)}
         self._arrivals = 0
         self._receipts = Receipts()
+        self._imus, self._imu_clock = frozenset(config.imu), ""  # the clock that stamps the inertial sensor's samples
 
     def steps_back(self, received: Received) -> bool:
         """Whether the receipts have stepped back with this event, so that nothing learnt so far is of use: see `forget`."""
@@ -42,7 +49,9 @@ class Clock:
             self._learn(received, payload)
             return None
         source, receive, stamp = received.source, received.t_receive_ns, received.t_sensor_ns
-        t_ns = receive
+        t_ns, clock = receive, received.clock if stamp is not None else ""
+        if source in self._imus:
+            self._imu_clock = clock
         if stamp is None or not received.clock:
             self._arrivals += 1
         elif isinstance(payload, Invalid):
@@ -53,7 +62,21 @@ class Clock:
                 t_ns = placed
             else:
                 payload = Invalid(placed)
-        return Measurement(t_ns - self._delays.get(source, 0), source, received.sequence, receive, payload)
+        sigma = 0.0 if clock == self._imu_clock else self._stamp_sigma(clock)
+        return Measurement(t_ns - self._delays.get(source, 0), source, received.sequence, receive, payload, sigma)
+
+    def _stamp_sigma(self, clock: str) -> float:
+        """Sigma [s] of what a clock and the inertial sensor's may be off against each other: each lies anywhere within its
+        bounds. Where Unix time comes by way of the inertial sensor's clock, both are off alike."""
+        own, imu = self._half_width(clock), self._half_width(self._imu_clock)
+        if own and imu and UNIX_CLOCK in (clock, self._imu_clock):
+            return 0.0
+        return math.sqrt((own * own + imu * imu) / 3) / SECOND
+
+    def _half_width(self, clock: str) -> int:
+        """Of the bounds of a clock's offset [ns]; 0 where it has none."""
+        aligner = self._aligners.get(clock)
+        return aligner.half_width if aligner is not None else 0
 
     def report(self) -> dict[str, ClockReport]:
         """How each clock is aligned, by name; "arrival" is for events without a stamp."""

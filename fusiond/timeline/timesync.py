@@ -48,7 +48,8 @@ class RoundTrips:
 
     def bounds(self, receive: int, most: int) -> tuple[int, int] | None:
         """The least and the largest offset when the host's clock reads `receive`, where receipts of samples say it is at
-        most `most`; None before the first round trip. Where the two contradict each other, the least is the larger one."""
+        most `most`; None before the first round trip. Their intersection is empty where the two contradict each other: the
+        least is then the larger one (THEORY A6)."""
         if self._bounds is None:
             return None
         above, below = self._bounds

@@ -26,6 +26,7 @@ from fusiond.filter.state import (
     T_FIRST_VELOCITY,
     T_POSITION,
     VELOCITY_E,
+    YAW_RATE_OFFSET,
     FilterState,
     ResetReason,
     T,
@@ -196,13 +197,13 @@ def running_state(
     """A running filter state with random values of realistic size, and a full covariance."""
     state = FilterState(sources, size)
     x = state.nominal[: size + 1]
-    x[:] = rng.normal(0.0, 0.01, len(x))
+    x[: YAW_RATE_OFFSET.start] = rng.normal(0.0, 0.01, len(x[: YAW_RATE_OFFSET.start]))  # of the car's own sensors nothing
     x[POSITION_E] = ecef(*start) + rng.normal(0.0, 100.0, 3)
     x[VELOCITY_E] = rng.normal(0.0, 10.0, 3)
     x[QUATERNION_EB] = quaternion(matrix_from_euler(*(float(a) for a in rng.uniform(-1.5, 1.5, 3))))
     root = rng.normal(0.0, 1.0, (state.size, state.size)) + 2 * np.eye(state.size)
-    sigmas = [1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0, 0.05, 0.01]
-    scale = np.repeat(sigmas, [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1])[:size]
+    sigmas = [1.0, 0.3, 0.03, 1e-3, 0.05, 5e-3, 1.0, 5e-3, 0.1, 0.05, 3.0, 0.05, 0.01, 0.01]
+    scale = np.repeat(sigmas, [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1, 4])[:size]
     covariance = scale[:, None] * (root @ root.T) * scale / size
     state.covariance[:] = (covariance + covariance.T) / 2
     state.auxiliary[:12] = rng.normal(0.0, 0.3, 12)

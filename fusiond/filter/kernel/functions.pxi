@@ -123,6 +123,9 @@ cdef void rotation_times(double* mat, double* v, double* out) noexcept nogil:
     out[2] = (((mat[(2) * 3 + 0] * v[0]) + (mat[(2) * 3 + 1] * v[1])) + (mat[(2) * 3 + 2] * v[2]))
     return
 
+cdef double rotation_inner(double* a, double* b) noexcept nogil:
+    return (((a[0] * b[0]) + (a[1] * b[1])) + (a[2] * b[2]))
+
 cdef void rotation_transposed_times(double* mat, double* v, double* out) noexcept nogil:
     out[0] = (((mat[(0) * 3 + 0] * v[0]) + (mat[(1) * 3 + 0] * v[1])) + (mat[(2) * 3 + 0] * v[2]))
     out[1] = (((mat[(0) * 3 + 1] * v[0]) + (mat[(1) * 3 + 1] * v[1])) + (mat[(2) * 3 + 1] * v[2]))
@@ -1315,7 +1318,7 @@ cdef bint measurement_fuse_measurement(State* state, Row* row, Parameters* param
         _t1 = 2
         m = _t1
         seen.m = _t1
-    elif ((state.nominal[34] > 0.05) and source_health_is_used(memory, True)):
+    elif ((state.nominal[38] > 0.05) and source_health_is_used(memory, True)):
         for a in range(m):
             seen.variance[a] = learnt[a]
         rivals_fit_lie(state, &seen, across, spread)
@@ -2206,6 +2209,14 @@ cdef bint observations_observe(State* state, int64_t model, double* row, double*
         return barometric_height_observe(state, row, parameter, seen)
     elif model == 4:
         return gnss_yaw_observe(state, row, parameter, seen)
+    elif model == 5:
+        return yaw_rate_observe(state, row, parameter, seen)
+    elif model == 6:
+        return steering_observe(state, row, parameter, seen)
+    elif model == 7:
+        return lateral_observe(state, row, parameter, seen)
+    elif model == 8:
+        return parked_observe(state, row, parameter, seen)
     return False
 
 # ---------------- fusiond.filter.observations.barometric_height
@@ -2246,9 +2257,9 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     cdef double off_e[3]
     cdef double slow
     cdef double _t4[3]
+    cdef double stamp
     cdef double _t5[3]
     cdef double _t6
-    cdef double _t7
     x = state.nominal
     wgs84_mat_ne(x, to_n)
     model_begin(seen, 3)
@@ -2279,13 +2290,15 @@ cdef bint gnss_position_observe(State* state, double* row, double* parameter, Ob
     rotation_times(to_n, off_e, _t4)
     for _i in range(3):
         seen.innovation[_i] = _t4[_i]
+    stamp = (parameter[6] * sqrt((1 - slow)))
+    if (row[7] > 0):
+        stamp = sqrt(((stamp * stamp) + (row[7] * row[7])))
     rotation_times(to_n, x + 3, _t5)
-    _t6 = (parameter[6] * sqrt((1 - slow)))
     for _i in range(3):
-        seen.common[_i] = (_t5[_i] * _t6)
-    _t7 = ((1 - slow) * row[3])
-    seen.variance[0] = _t7
-    seen.variance[1] = _t7
+        seen.common[_i] = (_t5[_i] * stamp)
+    _t6 = ((1 - slow) * row[3])
+    seen.variance[0] = _t6
+    seen.variance[1] = _t6
     seen.variance[2] = ((1 - slow) * row[4])
     return True
 
@@ -2346,6 +2359,9 @@ cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Ob
     cdef double _t3[3]
     cdef double predicted_n[3]
     cdef double _t4[3]
+    cdef double _t5[3]
+    cdef double _t6[3]
+    cdef double _t7
     x = state.nominal
     axes = (<int64_t>(row[4]))
     wgs84_mat_ne(x, to_n)
@@ -2378,6 +2394,12 @@ cdef bint gnss_velocity_observe(State* state, double* row, double* parameter, Ob
     for i in range(axes):
         seen.innovation[i] = (row[i] - predicted_n[i])
         seen.variance[i] = row[3]
+    if (row[7] > 0):
+        model_acceleration_e(state, _t6)
+        rotation_times(to_n, _t6, _t5)
+        _t7 = row[7]
+        for _i in range(3):
+            seen.common[_i] = (_t5[_i] * _t7)
     return True
 
 cdef void gnss_velocity__gained(State* state, double* to_n, double* turned, Observation* seen, double* out) noexcept nogil:
@@ -2449,6 +2471,74 @@ cdef bint gnss_yaw_observe(State* state, double* row, double* parameter, Observa
     seen.variance[0] = row[2]
     return True
 
+# ---------------- fusiond.filter.observations.lateral
+
+cdef bint lateral_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double by[3 * n]
+    cdef double velocity_v[3]
+    cdef double speed
+    cdef double axis_b[3]
+    cdef double across_b[3]
+    cdef double _t1[3]
+    cdef double _t2[3]
+    cdef double turn
+    cdef double mean
+    cdef double down_e[3]
+    cdef double down_b[3]
+    cdef double _t3[3 * 3]
+    cdef double across_e[3]
+    cdef double _t4[3 * 3]
+    cdef int64_t k
+    cdef double leaning[3 * 3]
+    cdef int _i
+    cdef double tilted[3 * n]
+    cdef int64_t i
+    cdef (double, double) _t5
+    cdef double sp
+    cdef double cp
+    cdef (double, double) _t6
+    cdef double sy
+    cdef double cy
+    model_begin(seen, 1)
+    model_point_velocity_v(state, parameter, 1, by, velocity_v)
+    speed = velocity_v[0]
+    if (fabs(speed) < parameter[5]):
+        seen.innovation[0], seen.variance[0] = 0.0, 1000000000000.0
+        return True
+    model_vertical_b(state, axis_b)
+    model_right_b(state, across_b)
+    model_rate_b(state, _t1)
+    model_mean_rate_b(state, _t2)
+    turn, mean = rotation_inner(axis_b, _t1), rotation_inner(axis_b, _t2)
+    wgs84_gravity_e(state.nominal, down_e)
+    model_mat_eb(state, _t3)
+    rotation_transposed_times(_t3, down_e, down_b)
+    model_mat_eb(state, _t4)
+    rotation_times(_t4, across_b, across_e)
+    for k in range(n):
+        seen.jacobian[(0) * n + k] = (mean * by[(0) * n + k])
+    memset(leaning, 0, 3 * 3 * sizeof(double))
+    for _i in range(3):
+        (leaning + (0) * 3)[_i] = across_e[_i]
+    memset(tilted, 0, 3 * n * sizeof(double))
+    model_skew_rows(leaning, down_e, (-1.0), 1, tilted, 6)
+    for i in range(3):
+        seen.jacobian[(0) * n + (6 + i)] += tilted[(0) * n + (6 + i)]
+        seen.jacobian[(0) * n + (9 + i)] -= (speed * axis_b[i])
+    seen.jacobian[(0) * n + 16] += (speed * model_turn_by_mount(state))
+    _t5 = portable_sin_cos(state.nominal[17])
+    sp = _t5[0]
+    cp = _t5[1]
+    _t6 = portable_sin_cos(state.nominal[(17 + 1)])
+    sy = _t6[0]
+    cy = _t6[1]
+    seen.jacobian[(0) * n + 16] -= (sy * ((cp * down_b[2]) - (sp * down_b[0])))
+    seen.jacobian[(0) * n + (16 + 1)] -= ((cy * ((cp * down_b[0]) + (sp * down_b[2]))) - (sy * down_b[1]))
+    seen.innovation[0] = ((row[0] - (speed * turn)) + rotation_inner(across_b, down_b))
+    seen.variance[0] = row[1]
+    model_with_rate_noise(state, seen)
+    return True
+
 # ---------------- fusiond.filter.observations.model
 
 cdef void model_begin(Observation* seen, int64_t axes) noexcept nogil:
@@ -2475,11 +2565,69 @@ cdef void model_with_rate_noise(State* state, Observation* seen) noexcept nogil:
         by = seen.jacobian + (a) * n + 9
         seen.variance[a] += (state.auxiliary[36] * (((by[0] * by[0]) + (by[1] * by[1])) + (by[2] * by[2])))
 
+cdef void model_acceleration_e(State* state, double* out) noexcept nogil:
+    cdef double* x
+    cdef double _t1[3]
+    cdef double _t2[3 * 3]
+    cdef double _t3[3]
+    cdef int _i
+    cdef double _t4[3]
+    x = state.nominal
+    model_mat_eb(state, _t2)
+    for _i in range(3):
+        _t3[_i] = ((state.auxiliary + 37)[_i] - (x + 13)[_i])
+    rotation_times(_t2, _t3, _t1)
+    wgs84_gravity_e(x, _t4)
+    for _i in range(3):
+        out[_i] = (_t1[_i] + _t4[_i])
+    return
+
 cdef void model_mean_rate_b(State* state, double* out) noexcept nogil:
     cdef int _i
     for _i in range(3):
         out[_i] = ((state.auxiliary + 15)[_i] - (state.nominal + 10)[_i])
     return
+
+cdef void model_vertical_b(State* state, double* out) noexcept nogil:
+    cdef (double, double) _t1
+    cdef double sp
+    cdef double cp
+    _t1 = portable_sin_cos(state.nominal[17])
+    sp = _t1[0]
+    cp = _t1[1]
+    out[0] = (-sp)
+    out[1] = 0.0
+    out[2] = cp
+    return
+
+cdef void model_right_b(State* state, double* out) noexcept nogil:
+    cdef (double, double) _t1
+    cdef double sp
+    cdef double cp
+    cdef (double, double) _t2
+    cdef double sy
+    cdef double cy
+    _t1 = portable_sin_cos(state.nominal[17])
+    sp = _t1[0]
+    cp = _t1[1]
+    _t2 = portable_sin_cos(state.nominal[(17 + 1)])
+    sy = _t2[0]
+    cy = _t2[1]
+    out[0] = (sy * cp)
+    out[1] = cy
+    out[2] = (sy * sp)
+    return
+
+cdef double model_turn_by_mount(State* state) noexcept nogil:
+    cdef (double, double) _t1
+    cdef double sp
+    cdef double cp
+    cdef double mean_b[3]
+    _t1 = portable_sin_cos(state.nominal[17])
+    sp = _t1[0]
+    cp = _t1[1]
+    model_mean_rate_b(state, mean_b)
+    return (((-cp) * mean_b[0]) - (sp * mean_b[2]))
 
 cdef void model_mat_eb(State* state, double* out) noexcept nogil:
     rotation_matrix(state.nominal + 6, out)
@@ -2606,6 +2754,66 @@ cdef void non_holonomic__slide(State* state, double speed, double* by, Observati
     seen.jacobian[(0) * n + (9 + 2)] -= (slip * along)
     seen.jacobian[(0) * n + 32] = (along * turn)
 
+# ---------------- fusiond.filter.observations.parked
+
+cdef bint parked_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef bint stands
+    cdef int64_t i
+    model_begin(seen, 3)
+    stands = (row[0] != 0.0)
+    for i in range(3):
+        seen.jacobian[(i) * n + (3 + i)] = (1.0 if stands else 0.0)
+        seen.innovation[i] = ((-state.nominal[(3 + i)]) if stands else 0.0)
+        seen.variance[i] = (row[1] if stands else 1000000000000.0)
+    return True
+
+# ---------------- fusiond.filter.observations.steering
+
+cdef bint steering_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double by[3 * n]
+    cdef double velocity_v[3]
+    cdef double speed
+    cdef double base
+    cdef double* x
+    cdef double axis_b[3]
+    cdef double _t1[3]
+    cdef double _t2[3]
+    cdef double turn
+    cdef double mean
+    cdef double factor
+    cdef double understeer
+    cdef double needed
+    cdef double by_speed
+    cdef int64_t k
+    cdef int64_t i
+    model_begin(seen, 1)
+    model_point_velocity_v(state, parameter, 1, by, velocity_v)
+    speed = velocity_v[0]
+    base = parameter[4]
+    x = state.nominal
+    if (fabs(speed) < parameter[5]):
+        seen.innovation[0], seen.variance[0] = 0.0, 1000000000000.0
+        return True
+    model_vertical_b(state, axis_b)
+    model_rate_b(state, _t1)
+    model_mean_rate_b(state, _t2)
+    turn, mean = rotation_inner(axis_b, _t1), rotation_inner(axis_b, _t2)
+    factor, understeer = (1 + x[36]), x[37]
+    needed = ((base / speed) + (understeer * speed))
+    by_speed = ((factor * mean) * (understeer - (base / (speed * speed))))
+    for k in range(n):
+        seen.jacobian[(0) * n + k] = (by_speed * by[(0) * n + k])
+    for i in range(3):
+        seen.jacobian[(0) * n + (9 + i)] -= ((factor * needed) * axis_b[i])
+    seen.jacobian[(0) * n + 16] += ((factor * needed) * model_turn_by_mount(state))
+    seen.jacobian[(0) * n + 34] = 1.0
+    seen.jacobian[(0) * n + 35] = (needed * mean)
+    seen.jacobian[(0) * n + 36] = ((factor * speed) * mean)
+    seen.innovation[0] = ((row[0] - x[35]) - ((factor * needed) * turn))
+    seen.variance[0] = row[1]
+    model_with_rate_noise(state, seen)
+    return True
+
 # ---------------- fusiond.filter.observations.wheel_speed
 
 cdef bint wheel_speed_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
@@ -2634,6 +2842,8 @@ cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Obs
     cdef int64_t k
     cdef double spread
     cdef double sure
+    cdef double rotation[3 * 3]
+    cdef double gained_e[3]
     steered = (parameter[4] != 0.0)
     model_point_velocity_v(state, parameter, (2 if steered else 1), by, velocity_v)
     forward, sideways = velocity_v[0], velocity_v[1]
@@ -2652,7 +2862,7 @@ cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Obs
             jacobian[_i] = (scale * (by + (0) * n)[_i])
     jacobian[which] = speed
     reading, variance = row[0], row[1]
-    if ((parameter[5] != 0.0) and (reading > 0)):
+    if ((parameter[5] != 0.0) and (reading > 0) and (row[3] == 0.0)):
         if (certain or (fabs(speed) > 2.0)):
             if (speed < 0):
                 reading = (-reading)
@@ -2670,6 +2880,11 @@ cdef bint wheel_speed__observe(State* state, double* row, double* parameter, Obs
         seen.common[_i] = 0.0
     seen.innovation[0] = (reading - (scale * speed))
     seen.variance[0] = variance
+    if (row[7] > 0):
+        model_mat_eb(state, rotation)
+        model_acceleration_e(state, gained_e)
+        along = (((rotation[(0) * 3 + 0] * gained_e[0]) + (rotation[(1) * 3 + 0] * gained_e[1])) + (rotation[(2) * 3 + 0] * gained_e[2]))
+        seen.variance[0] += portable_square((along * row[7]))
     return True
 
 cdef double wheel_speed_direction(double odds) noexcept nogil:
@@ -2678,6 +2893,24 @@ cdef double wheel_speed_direction(double odds) noexcept nogil:
     other = portable_exp(((-2) * fabs(odds)))
     sure = ((1 - other) / (1 + other))
     return ((-sure) if (odds < 0) else sure)
+
+# ---------------- fusiond.filter.observations.yaw_rate
+
+cdef bint yaw_rate_observe(State* state, double* row, double* parameter, Observation* seen) noexcept nogil:
+    cdef double axis_b[3]
+    cdef int64_t i
+    cdef double _t1[3]
+    model_begin(seen, 1)
+    model_vertical_b(state, axis_b)
+    for i in range(3):
+        seen.jacobian[(0) * n + (9 + i)] = (-axis_b[i])
+    seen.jacobian[(0) * n + 16] = model_turn_by_mount(state)
+    seen.jacobian[(0) * n + 33] = 1.0
+    model_rate_b(state, _t1)
+    seen.innovation[0] = ((row[0] - rotation_inner(axis_b, _t1)) - state.nominal[34])
+    seen.variance[0] = row[1]
+    model_with_rate_noise(state, seen)
+    return True
 
 # ---------------- fusiond.filter.observations.zero_rotation
 
@@ -2786,7 +3019,7 @@ cdef void rivals_suspect_motion(State* state, double odds) noexcept nogil:
     if (state.bank[(0) * BLOCK + 0] == 0):
         rivals_open_slot(state, 0, odds)
         rival = hypothesis_of(state, 0)
-        rival.nominal[34] = 1.0
+        rival.nominal[38] = 1.0
         for k in range(3, 15):
             rival.covariance[(k) * n + k] += (0.1 * rivals_lie_variance(k))
     if (state.bank[(3) * BLOCK + 0] == 0):
@@ -2821,7 +3054,7 @@ cdef double rivals_fit_lie(State* rival, Observation* seen, double* across, doub
     memset(lie, 0, n * sizeof(double))
     memset(off, 0, 3 * sizeof(double))
     rivals_with_lie(seen, spread, 100.0, widened)
-    if ((not (rival.nominal[34] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
+    if ((not (rival.nominal[38] > 0.05)) or (not measurement_update_cholesky(widened, seen.variance, 1.0, m, lower))):
         return 1.0
     for a in range(m):
         solved[a] = seen.innovation[a]
@@ -3062,7 +3295,7 @@ cdef void rivals_decide(State* state, bint disputed, Parameters* params) noexcep
     for slot in range(4):
         state.bank[(slot) * BLOCK + 0] = (state.bank[(slot) * BLOCK + 0] / total)
     inertial = hypothesis_of(state, 0)
-    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[34] > 0.05))
+    young = ((state.bank[(0) * BLOCK + 0] > 0) and (inertial.nominal[38] > 0.05))
     excluded = (state.memory[((<int64_t>(state.stamps[23]))) * MEMORY_SIZE + 18] != 0)
     for slot in range(4):
         if (0 < state.bank[(slot) * BLOCK + 0] < (1e-07 if (young or (excluded and (slot == 0))) else (0.01 / 10))):
@@ -3232,10 +3465,10 @@ cdef void smoothing__note_look(State* state, int64_t look, double* looks) noexce
     cdef int64_t at
     cdef int64_t k
     cdef int64_t i
-    at = (look * ((35 + (n * n)) + 8))
-    for k in range(35):
+    at = (look * ((39 + (n * n)) + 8))
+    for k in range(39):
         looks[(at + k)] = state.nominal[k]
-    at += 35
+    at += 39
     for i in range(n):
         for k in range(n):
             looks[((at + (i * n)) + k)] = state.covariance[(i) * n + k]
@@ -3592,15 +3825,15 @@ cdef void smoothing__smooth_look(State* state, double* vector, double* matrix, d
     cdef int64_t k
     cdef int64_t i
     size = n
-    at = (look * ((35 + (size * size)) + 8))
-    covariance = (at + 35)
-    for k in range(35):
+    at = (look * ((39 + (size * size)) + 8))
+    covariance = (at + 39)
+    for k in range(39):
         state.nominal[k] = looks[(at + k)]
     for i in range(n):
         for k in range(n):
             state.covariance[(i) * n + k] = looks[((covariance + (i * size)) + k)]
     smoothing_smooth(state, vector, matrix)
-    for k in range(35):
+    for k in range(39):
         looks[(at + k)] = state.nominal[k]
     for i in range(n):
         for k in range(n):
@@ -4408,12 +4641,12 @@ cdef void strapdown__step(State* state, double dt, double* force_b, double* rate
     strapdown__grow(state.covariance, dt, force_e, mat_eb, gradient)
     if state.tracked:
         strapdown__follow(state.transition, dt, force_e, mat_eb, gradient)
-    doubt = x[34]
+    doubt = x[38]
     strapdown__add_noise(state.covariance, dt, (noise.accel + (doubt * 0.01)), (noise.gyro + (doubt * 0.0001)), noise)
     if (doubt > 0):
         for i in range(3):
             state.covariance[((9 + i)) * n + (9 + i)] += ((doubt * 0.0001) * dt)
-        x[34] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
+        x[38] = ((doubt * portable_exp(((-dt) / 1.0))) if (doubt > 0.001) else 0.0)
 
 cdef void strapdown_gravity_gradient(double* position_e, double* out) noexcept nogil:
     cdef double r2

@@ -1,14 +1,14 @@
 # Made by tools/translate_kernel from fusiond/filter and fusiond/maths: not to be edited. `n`: number of error states.
 
 cdef enum:
-    NOMINAL_SIZE = 35
+    NOMINAL_SIZE = 39
     AUXILIARY_SIZE = 86
     MEMORY_SIZE = 24
     STAMPS_SIZE = 24
     SOURCE_STAMPS_SIZE = 5
     HYPOTHESES = 13
     CALIBRATIONS = 15
-    WIDE_SIZE = 33
+    WIDE_SIZE = 37
     PHASE = 10
     CHOOSING = 3
     ALIVE = 22

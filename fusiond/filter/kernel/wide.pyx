@@ -3,6 +3,6 @@
 """The compiled hot loop (kernel.pxi) for the state with all calibrations: see there."""
 
 cdef enum:
-    n = 33  # error states
+    n = 37  # error states
 
 include "kernel.pxi"

@@ -10,8 +10,12 @@ from fusiond.filter.observations import (
     gnss_position,
     gnss_velocity,
     gnss_yaw,
+    lateral,
     non_holonomic,
+    parked,
+    steering,
     wheel_speed,
+    yaw_rate,
     zero_rotation,
     zero_velocity,
 )
@@ -37,11 +41,16 @@ MODELS = (
     Model("wheel_speed", wheel_speed.parameters, wheel_speed.values, wheel_speed.observe),
     Model("barometric_height", barometric_height.parameters, barometric_height.values, barometric_height.observe),
     Model("gnss_yaw", gnss_yaw.parameters, gnss_yaw.values, gnss_yaw.observe),
+    Model("yaw_rate", yaw_rate.parameters, yaw_rate.values, yaw_rate.observe),
+    Model("steering", steering.parameters, steering.values, steering.observe),
+    Model("lateral_acceleration", lateral.parameters, lateral.values, lateral.observe),
+    Model("parked", parked.parameters, parked.values, parked.observe),
 )
 IMU = -1  # stands for the inertial sensor where others have their place in MODELS
 MODEL = {model.name: number for number, model in enumerate(MODELS)}
 GNSS_POSITION, GNSS_VELOCITY, WHEEL_SPEED = MODEL["gnss_position"], MODEL["gnss_velocity"], MODEL["wheel_speed"]
 GNSS_YAW = MODEL["gnss_yaw"]
+ON_AXLE = (MODEL["steering"], MODEL["lateral_acceleration"])  # models whose point is the middle of the unsteered axle
 CONSTRAINTS = (non_holonomic, zero_velocity, zero_rotation)  # observed by the filter itself: rows of Parameters.constraints
 
 

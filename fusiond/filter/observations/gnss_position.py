@@ -13,6 +13,7 @@ from fusiond.filter.observations.model import (
     CALIBRATED,
     LEVER_ARM_B,
     RESETS,
+    STAMP_ERROR,
     Observation,
     Unusable,
     begin,
@@ -103,7 +104,10 @@ def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observatio
         for i in range(3):
             seen.jacobian[i, GNSS_ERROR] = to_n[i]
     seen.innovation[:] = times(to_n, off_e)
-    seen.common[:] = times(to_n, x[VELOCITY_E]) * (parameter[STAMP_SIGMA] * math.sqrt(1 - slow))
+    stamp = parameter[STAMP_SIGMA] * math.sqrt(1 - slow)
+    if row[STAMP_ERROR] > 0:
+        stamp = math.sqrt(stamp * stamp + row[STAMP_ERROR] * row[STAMP_ERROR])
+    seen.common[:] = times(to_n, x[VELOCITY_E]) * stamp
     seen.variance[0] = seen.variance[1] = (1 - slow) * row[VARIANCE_HORIZONTAL]
     seen.variance[2] = (1 - slow) * row[VARIANCE_VERTICAL]
     return True

@@ -11,7 +11,9 @@ from fusiond.filter.observations.model import (
     LEVER_ARM_B,
     RESETS,
     SPEED_LIMIT,
+    STAMP_ERROR,
     Observation,
+    acceleration_e,
     begin,
     empty_row,
     mat_eb,
@@ -95,6 +97,8 @@ def observe(state: FilterState, row: Vector, parameter: Vector, seen: Observatio
     for i in range(axes):
         seen.innovation[i] = row[i] - predicted_n[i]
         seen.variance[i] = row[VARIANCE]
+    if row[STAMP_ERROR] > 0:
+        seen.common[:] = times(to_n, acceleration_e(state)) * row[STAMP_ERROR]
     return True
 
 

@@ -12,15 +12,18 @@ import math
 import numpy as np
 
 from fusiond.filter.state import (
+    ACCEL_BIAS_B,
     ATTITUDE,
     GYRO_BIAS,
     GYRO_BIAS_B,
     MEAN_RATE_B,
     MOUNT,
     MOUNT_ERROR,
+    POSITION_E,
     QUATERNION_EB,
     RATE_B,
     RATE_VARIANCE,
+    SMOOTH_FORCE_B,
     VELOCITY,
     VELOCITY_E,
     FilterState,
@@ -28,8 +31,11 @@ from fusiond.filter.state import (
 from fusiond.maths.portable import sin_cos
 from fusiond.maths.rotation import cross, matrix, times, transposed_times
 from fusiond.maths.typed import Array, ErrorRows3, Matrix3, Vector3, compiled
+from fusiond.maths.wgs84 import gravity_e
 
 VALUES = 8  # width of a measurement's row
+UNWEIGHTED = 1e12  # variance of a reading that says nothing at present
+STAMP_ERROR = VALUES - 1  # s, sigma by which the clocks may have placed a reading off, values of every model
 PARAMETERS = 16  # width of a source's row
 SPEED_LIMIT = 1000.0  # m/s: a speed beyond is not one
 LEVER_ARM_B = slice(0, 3)  # parameters that models share: m, the sensor from the IMU
@@ -117,10 +123,40 @@ def with_rate_noise(state: FilterState, seen: Observation) -> None:
 
 
 @compiled
+def acceleration_e(state: FilterState) -> Vector3:
+    """Acceleration (3,) [m/s^2] over ground, e axes, without Coriolis' part: a mean over some 0.1 s."""
+    x = state.nominal
+    return times(mat_eb(state), state.auxiliary[SMOOTH_FORCE_B] - x[ACCEL_BIAS_B]) + gravity_e(x[POSITION_E])
+
+
+@compiled
 def mean_rate_b(state: FilterState) -> Vector3:
     """Mean angular rate (3,) [rad/s] of the last half second, freed of bias: for derivatives. The noise of the rate itself
     is in the innovation too, or looks like motion: their product would be a bias, or knowledge that is none."""
     return state.auxiliary[MEAN_RATE_B] - state.nominal[GYRO_BIAS_B]
+
+
+@compiled
+def vertical_b(state: FilterState) -> Vector3:
+    """The vehicle's vertical axis (3,), downwards, in body axes: it is turned by the mount's pitch."""
+    sp, cp = sin_cos(state.nominal[MOUNT.start])
+    return np.array([-sp, 0.0, cp])
+
+
+@compiled
+def right_b(state: FilterState) -> Vector3:
+    """The vehicle's axis (3,) to the right in body axes."""
+    sp, cp = sin_cos(state.nominal[MOUNT.start])
+    sy, cy = sin_cos(state.nominal[MOUNT.start + 1])
+    return np.array([sy * cp, cy, sy * sp])
+
+
+@compiled
+def turn_by_mount(state: FilterState) -> float:
+    """By how much the turn rate about that axis grows with the mount's pitch [rad/s per rad]."""
+    sp, cp = sin_cos(state.nominal[MOUNT.start])
+    mean_b = mean_rate_b(state)
+    return -cp * mean_b[0] - sp * mean_b[2]
 
 
 @compiled

@@ -15,8 +15,11 @@ from fusiond.events import WheelSpeed
 from fusiond.filter.observations.model import (
     LEVER_ARM_B,
     SPEED_LIMIT,
+    STAMP_ERROR,
     Observation,
+    acceleration_e,
     empty_row,
+    mat_eb,
     point_velocity_v,
     within,
 )
@@ -26,6 +29,7 @@ from fusiond.maths.portable import exp, square
 from fusiond.maths.typed import Array, Vector, compiled
 
 SPEED, VARIANCE, CORRELATED = 0, 1, 2  # m/s, (m/s)^2, s over which errors stay correlated: values
+SIGNED = 3  # 1 where the reading has its direction from elsewhere: values
 STEERED, UNSIGNED = 4, 5  # parameters: 1 or 0
 SCALE_STATE = 6  # parameters: the error state of its scale; the nominal state is one higher
 SLOW_CORRELATION = 1.0  # s: a slow wheel stays slow at least this long
@@ -38,7 +42,9 @@ def parameters(wheel: Wheel) -> Array:
     row = empty_row()
     row[LEVER_ARM_B] = wheel.position_m
     row[STEERED] = float(wheel.steered)
-    row[UNSIGNED] = float(wheel.unsigned and wheel.direction_signal is None)
+    told = wheel.direction_signal is not None and "." not in wheel.direction_signal  # by each of its frames
+    always_signed = told and wheel.forward_values is None
+    row[UNSIGNED] = float(wheel.unsigned and not always_signed)
     row[SCALE_STATE] = SCALE.start
     return row
 
@@ -53,6 +59,8 @@ def values(reading: WheelSpeed, wheel: Wheel) -> tuple[float, ...]:
     variance = sigma * sigma + quantum * quantum / 12 + own * own
     if -wheel.least_mps < speed < wheel.least_mps:
         return speed, variance + square(wheel.least_mps) / 3, max(wheel.correlation_s, SLOW_CORRELATION)
+    if reading.signed:
+        return speed, variance, wheel.correlation_s, 1.0
     return speed, variance, wheel.correlation_s
 
 
@@ -87,7 +95,7 @@ def _observe(state: FilterState, row: Vector, parameter: Vector, seen: Observati
         jacobian[:] = scale * by[0]
     jacobian[which] = speed
     reading, variance = row[SPEED], row[VARIANCE]
-    if parameter[UNSIGNED] != 0.0 and reading > 0:
+    if parameter[UNSIGNED] != 0.0 and reading > 0 and row[SIGNED] == 0.0:
         if certain or abs(speed) > SURE_SPEED:
             if speed < 0:
                 reading = -reading
@@ -104,6 +112,10 @@ def _observe(state: FilterState, row: Vector, parameter: Vector, seen: Observati
     seen.common[:] = 0.0
     seen.innovation[0] = reading - scale * speed
     seen.variance[0] = variance
+    if row[STAMP_ERROR] > 0:
+        rotation, gained_e = mat_eb(state), acceleration_e(state)
+        along = rotation[0, 0] * gained_e[0] + rotation[1, 0] * gained_e[1] + rotation[2, 0] * gained_e[2]
+        seen.variance[0] += square(along * row[STAMP_ERROR])
     return True
 
 

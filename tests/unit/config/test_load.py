@@ -110,6 +110,10 @@ SENSORS = {  # a table of each kind of sensor, its last line the input that it c
     "wheel.right": "index = 2\nlink = 'autopilot'",
     "barometer.b": "link = 'autopilot'",
     "dual_antenna.yaw": "link = 'autopilot'",
+    "yaw_rate.esc": "signal = 'm.a'\nbus = 'chassis'",
+    "steering.wheel": "signal = 'm.a'\nwheelbase_m = 2.7\nbus = 'chassis'",
+    "lateral_acceleration.esc": "signal = 'm.a'\nbus = 'chassis'",
+    "parked.gear": "signal = 'm.a'\nbus = 'chassis'",
 }
 
 

@@ -106,9 +106,9 @@ def test_the_smallest_configuration_is_valid(tmp_path: Path) -> None:
 
 def test_the_examples_of_the_workshop_guide_are_valid(tmp_path: Path) -> None:
     (tmp_path / "car.dbc").touch()
-    first, wheel = examples("tuning.md", "toml")
-    parsed = config.parse(f"{first}\n{wheel}", tmp_path / "car.toml")
+    parsed = config.parse("\n".join(examples("tuning.md", "toml")), tmp_path / "car.toml")
     assert parsed.wheel["rear_left"].counter_signal == "COUNTER"
+    assert parsed.parked["gear"].values == [32]
 
 
 def test_the_code_of_the_walk_through_is_that_of_the_tree() -> None:

@@ -12,6 +12,7 @@ from tests.helpers.paths import ROOT
 UNIT = ROOT / "tests" / "unit"
 FOLDERS = {"adapters": ROOT / "adapters", "oracles": ROOT / "tests" / "oracles", "tools": ROOT / "tools"}  # else fusiond
 SCENARIOS = {  # tests of several modules together, and which
+    "adapters/can/test_car.py": "the car's own sensors, and a direction out of another frame, by way of the decoder",
     "adapters/can/test_presets.py": "the sample configurations of cars, by way of decoder and check",
     "adapters/logs/test_captured_logs.py": "real recordings through readers and decoders",
     "adapters/mavlink/test_peers.py": "an autopilot made of pymavlink against the daemon",

@@ -180,3 +180,59 @@ def test_unix_and_boot_stamps_are_right_if_the_host_clock_is_wrong(wrong: int) -
     assert abs(boot_error) < MS // 10
     assert abs(unix_error) < MS + MS // 10  # SYSTEM_TIME's boot time is cut off to a millisecond
     assert {name: report.method for name, report in clock.report().items()} == {BOOT: "timesync", "unix": "timesync"}
+
+
+# --- Bounds (THEORY A6)
+
+
+def test_the_bounds_of_a_clock_are_told_and_hold_the_truth() -> None:
+    clock = Clock(CONFIG)
+    drive(clock, SECOND, 5, latency=40 * MS, trip=16 * MS)
+    report = clock.report()[BOOT]
+    assert report.bounds_ns is not None
+    least, most = report.bounds_ns
+    assert least <= T0 <= most
+    assert most - least == pytest.approx(16 * MS, abs=MS // 10)
+    assert report.faults == 0
+
+
+def test_an_event_of_another_clock_is_told_how_far_off_it_may_lie() -> None:
+    """Bounds 16 ms apart: uniform within 8 ms either way, so a sigma of 8 / sqrt 3 ms."""
+    clock = Clock(CONFIG)
+    before = clock.align(Received("left", 0, "", None, T0, SAMPLE))
+    drive(clock, SECOND, 5, latency=40 * MS, trip=16 * MS)
+    now = T0 + 6 * SECOND
+    wheel = clock.align(Received("left", 1, "", None, now, SAMPLE))
+    same = clock.align(imu(6 * SECOND, now + 40 * MS))
+    assert before is not None
+    assert wheel is not None
+    assert same is not None
+    assert (before.stamp_sigma, same.stamp_sigma) == (0.0, 0.0)
+    assert wheel.stamp_sigma == pytest.approx(8e-3 / 3**0.5, rel=0.02)
+
+
+def test_unix_time_by_way_of_the_boot_clock_shares_its_error() -> None:
+    clock = Clock(CONFIG)
+    for k in range(250):
+        boot = SECOND + k * 20 * MS
+        if k % 50 == 0:
+            clock.align(answer(boot + 8 * MS, T0 + boot, T0 + boot + 16 * MS))
+            clock.align(system_time(T0 + boot, boot, T0 + boot + 12 * MS))
+        clock.align(imu(boot, T0 + boot + 10 * MS))
+    fix = clock.align(Received("gps0.position", 0, "unix", T0 + 6 * SECOND, T0 + 6 * SECOND + 90 * MS, SAMPLE))
+    assert fix is not None
+    assert clock.report()["unix"].method == "timesync"
+    assert fix.stamp_sigma == 0.0
+
+
+def test_bounds_that_contradict_each_other_are_a_fault() -> None:
+    """The autopilot's clock steps by 12 ms: no trip deviates by so little, but nothing is left between the bounds."""
+    clock = Clock(CONFIG)
+    drive(clock, SECOND, 5, trip=2 * MS)
+    assert clock.report()[BOOT].faults == 0
+    error = drive(clock, 7 * SECOND, 20, zero=T0 - 12 * MS, trip=2 * MS)
+    report = clock.report()[BOOT]
+    assert (report.faults, report.method) == (1, "timesync")
+    assert abs(error) < MS
+    assert report.bounds_ns is not None
+    assert report.bounds_ns[0] <= T0 - 12 * MS <= report.bounds_ns[1]

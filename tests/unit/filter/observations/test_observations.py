@@ -10,8 +10,19 @@ import msgspec
 import numpy as np
 import pytest
 
+from fusiond.config.car import LateralAccelerometer, ParkedSensor, Steering, YawRateSensor
 from fusiond.config.schema import Barometer, DualAntenna, Gnss, Motion, Wheel
-from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, Pressure, WheelSpeed
+from fusiond.events import (
+    GnssPosition,
+    GnssVelocity,
+    GnssYaw,
+    LateralAcceleration,
+    Parked,
+    Pressure,
+    SteeringAngle,
+    WheelSpeed,
+    YawRate,
+)
 from fusiond.filter.measurement_update import inject
 from fusiond.filter.observations import (
     CONSTRAINTS,
@@ -20,12 +31,25 @@ from fusiond.filter.observations import (
     gnss_position,
     gnss_velocity,
     gnss_yaw,
+    lateral,
     non_holonomic,
+    parked,
+    steering,
     wheel_speed,
+    yaw_rate,
     zero_rotation,
     zero_velocity,
 )
-from fusiond.filter.observations.model import LEVER_ARM_B, PARAMETERS, VALUES, Observation, mat_eb, rate_b
+from fusiond.filter.observations.model import (
+    LEVER_ARM_B,
+    PARAMETERS,
+    STAMP_ERROR,
+    UNWEIGHTED,
+    VALUES,
+    Observation,
+    mat_eb,
+    rate_b,
+)
 from fusiond.filter.observations.wheel_speed import direction
 from fusiond.filter.state import (
     GYRO_BIAS_B,
@@ -37,9 +61,13 @@ from fusiond.filter.state import (
     SLIP,
     SLIP_ERROR,
     SMOOTH_FORCE_B,
+    STEERING_FACTOR,
+    STEERING_OFFSET,
+    UNDERSTEER,
     VELOCITY_E,
     WHEEL_SCALE,
     WIDE_SIZE,
+    YAW_RATE_OFFSET,
     FilterState,
 )
 from fusiond.maths.rotation import matrix_from_euler, quaternion
@@ -52,8 +80,12 @@ GNSS = Gnss(link="l", lever_arm_m=(-0.4, 0.3, -1.2))
 WHITE = msgspec.structs.replace(GNSS, position_correlation_s=0.0)
 WHEEL = Wheel(bus="b", message="m", signal="s", position_m=(1.3, -0.8, 0.5))
 MOTION = Motion(point_m=(-1.2, 0.1, 0.4), minimum_speed_mps=0.0)
-WIDTHS = [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1]
-STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0, 0.01, 0.01], WIDTHS)
+WIDTHS = [3, 3, 3, 3, 3, 3, 3, 3, 3, 2, 1, 2, 1, 4]
+STEPS = np.repeat([1.0, 0.1, 1e-4, 1e-3, 0.1, 1e-4, 1.0, 1e-4, 0.1, 0.01, 1.0, 0.01, 0.01, 1e-4], WIDTHS)
+YAW_RATE = YawRateSensor(bus="b", signal="m.s")
+STEERING = Steering(bus="b", signal="m.s", wheelbase_m=2.7)
+ACROSS = LateralAccelerometer(bus="b", signal="m.s")
+PARKED = ParkedSensor(bus="b", signal="m.s")
 BAROMETER = Barometer(link="l")
 ANTENNAS = DualAntenna(link="l", offset_deg=50.0)
 LEARNT = msgspec.structs.replace(GNSS, lever_arm_sigma_m=0.3, delay_sigma_ms=100.0, velocity_delay_sigma_ms=50.0)
@@ -63,6 +95,12 @@ Observe = Callable[[FilterState, Array, Array, Observation], bool]
 OBSERVE: dict[str, Observe] = {model.name: model.observe for model in MODELS} | {
     constraint.__name__.rpartition(".")[2]: constraint.observe for constraint in CONSTRAINTS
 }
+
+
+def on_axle(row: Array) -> Array:
+    """Parameters of a model whose point is the middle of the unsteered axle."""
+    row[LEVER_ARM_B] = MOTION.point_m
+    return row
 
 
 class Case(NamedTuple):
@@ -112,6 +150,24 @@ CASES = {
     "steered and slow": wheel_case(0.05, 0.0, steered=True),
     "non-holonomic": Case("non_holonomic", (), non_holonomic.parameters(MOTION), 10.0),
     "non-holonomic in reverse": Case("non_holonomic", (), non_holonomic.parameters(MOTION), -4.0),
+    "yaw rate": Case("yaw_rate", yaw_rate.values(YawRate(0.2), YAW_RATE), yaw_rate.parameters(YAW_RATE), 10.0),
+    "steering": Case(
+        "steering", steering.values(SteeringAngle(0.1), STEERING), on_axle(steering.parameters(STEERING)), 10.0
+    ),
+    "steering in reverse": Case(
+        "steering", steering.values(SteeringAngle(0.1), STEERING), on_axle(steering.parameters(STEERING)), -10.0
+    ),
+    "steering, slow": Case(
+        "steering", steering.values(SteeringAngle(0.1), STEERING), on_axle(steering.parameters(STEERING)), 1.0
+    ),
+    "across": Case(
+        "lateral_acceleration", lateral.values(LateralAcceleration(1.0), ACROSS), on_axle(lateral.parameters(ACROSS)), 10.0
+    ),
+    "across, slow": Case(
+        "lateral_acceleration", lateral.values(LateralAcceleration(1.0), ACROSS), on_axle(lateral.parameters(ACROSS)), 1.0
+    ),
+    "parked": Case("parked", parked.values(Parked(True), PARKED), parked.parameters(PARKED), 0.1),
+    "not parked": Case("parked", parked.values(Parked(False), PARKED), parked.parameters(PARKED), 5.0),
     "zero velocity": Case("zero_velocity", (), zero_velocity.parameters(MOTION), 0.2),
     "zero rotation": Case("zero_rotation", (), zero_rotation.parameters(MOTION), 0.0),
 }
@@ -122,6 +178,7 @@ def moving_state(rng: np.random.Generator, speed: float) -> FilterState:
     state = running_state(rng, size=WIDE_SIZE)
     slip = 0.1 if abs(speed) > 1 else 0.01
     state.nominal[SLIP] = 0.02
+    state.nominal[STEERING_FACTOR], state.nominal[UNDERSTEER] = 0.1, 0.004
     state.nominal[VELOCITY_E] = mat_eb(state) @ rng.normal((speed, 0.0, 0.0), slip)
     state.auxiliary[SMOOTH_FORCE_B] = rng.normal((0.0, 0.0, -9.8), 0.5)
     state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = rng.normal(0.0, 0.3 if abs(speed) > 1 else 0.005, 3)
@@ -324,3 +381,109 @@ def test_parameters_fit_their_row() -> None:
     rows = [gnss_position.parameters(GNSS), wheel_speed.parameters(WHEEL), non_holonomic.parameters(MOTION)]
     assert all(row.shape == (PARAMETERS,) for row in rows)
     np.testing.assert_array_equal(rows[0][LEVER_ARM_B], GNSS.lever_arm_m)
+
+
+# --- The car's own sensors
+
+
+def bend(speed: float, turn: float, roll: float = 0.0) -> FilterState:
+    """A vehicle that faces 0.4 rad east of north, and drives forward in a bend to the right by `turn` [rad/s]."""
+    state = FilterState(7, WIDE_SIZE)
+    to_n = mat_ne(ecef(*MUNICH))
+    state.nominal[POSITION_E] = ecef(*MUNICH)
+    state.nominal[QUATERNION_EB] = quaternion(to_n.T @ matrix_from_euler(roll, 0.0, 0.4))
+    state.nominal[VELOCITY_E] = mat_eb(state) @ np.array([speed, 0.0, 0.0])
+    state.auxiliary[RATE_B] = state.auxiliary[MEAN_RATE_B] = (0.0, 0.0, turn)
+    return state
+
+
+def test_the_yaw_rate_has_an_offset() -> None:
+    state = bend(10.0, 0.3)
+    state.nominal[GYRO_BIAS_B] = (0.0, 0.0, 0.01)
+    state.nominal[YAW_RATE_OFFSET] = 0.02
+    seen = found(yaw_rate.observe, state, padded(yaw_rate.values(YawRate(0.31), YAW_RATE)), yaw_rate.parameters(YAW_RATE))
+    assert seen.innovation == pytest.approx([0.0], abs=1e-12)
+    assert seen.variance == pytest.approx([math.radians(0.3) ** 2])
+
+
+@pytest.mark.parametrize("speed", [10.0, -5.0])
+def test_the_steering_of_a_bend_by_hand(speed: float) -> None:
+    """At 10 m/s and 0.2 rad/s the radius is 50 m: 2.7 m / 50 m, and 2 m/s^2 of understeer at 0.003 rad each."""
+    state = bend(speed, 0.2)
+    state.nominal[STEERING_OFFSET], state.nominal[STEERING_FACTOR], state.nominal[UNDERSTEER] = 0.01, 0.05, 0.003
+    angle = 0.01 + 1.05 * (2.7 / (speed / 0.2) + 0.003 * speed * 0.2)
+    row = padded(steering.values(SteeringAngle(angle), STEERING))
+    seen = found(steering.observe, state, row, steering.parameters(STEERING))
+    assert seen.innovation == pytest.approx([0.0], abs=1e-12)
+    assert seen.variance == pytest.approx([(math.radians(2.0) / 15.0) ** 2])
+
+
+def test_steering_and_acceleration_say_nothing_at_walking_pace() -> None:
+    state = bend(2.9, 0.2)
+    cases = (
+        (steering.observe, steering.values(SteeringAngle(1.0), STEERING), steering.parameters(STEERING)),
+        (lateral.observe, lateral.values(LateralAcceleration(9.0), ACROSS), lateral.parameters(ACROSS)),
+    )
+    for observe, values, parameters in cases:
+        seen = found(observe, state, padded(values), parameters)
+        assert (seen.innovation[0], seen.variance[0], np.abs(seen.jacobian).max()) == (0.0, UNWEIGHTED, 0.0)
+
+
+def test_the_acceleration_across_in_a_banked_bend() -> None:
+    """In a bend to the right, leaning to the right by 0.1 rad: gravity pulls the sensor's mass to the right, too."""
+    state = bend(10.0, 0.2, roll=0.1)
+    force = 10.0 * 0.2 - 9.8073 * math.sin(0.1)  # gravity at Munich, 500 m
+    row = padded(lateral.values(LateralAcceleration(force), ACROSS))
+    seen = found(lateral.observe, state, row, lateral.parameters(ACROSS))
+    assert seen.innovation == pytest.approx([0.0], abs=2e-3)
+
+
+def test_only_a_parked_car_stands() -> None:
+    state = bend(0.2, 0.0)
+    stands = found(parked.observe, state, padded(parked.values(Parked(True), PARKED)), parked.parameters(PARKED))
+    assert np.linalg.norm(stands.innovation) == pytest.approx(0.2)
+    assert stands.variance == pytest.approx([0.0025] * 3)
+    drives = found(parked.observe, state, padded(parked.values(Parked(False), PARKED)), parked.parameters(PARKED))
+    assert (np.abs(drives.innovation).max(), np.abs(drives.jacobian).max(), drives.variance.min()) == (0, 0, UNWEIGHTED)
+
+
+# --- Clocks that may have placed a reading off
+
+
+def common_of(observe: Observe, state: FilterState, row: Array, parameters: Array) -> Array:
+    seen = Observation(state.size)
+    assert observe(state, row, parameters, seen)
+    return seen.common[: seen.m]
+
+
+def test_an_uncertain_clock_widens_what_moves() -> None:
+    """By 30 ms at 20 m/s: 0.6 m along the way, beside 0.2 m by the receiver's own stamp; at 3 m/s^2: 0.09 m/s."""
+    state = bend(20.0, 0.0)
+    to_n = mat_ne(ecef(*MUNICH))
+    state.auxiliary[SMOOTH_FORCE_B] = mat_eb(state).T @ to_n.T @ np.array([3 * math.cos(0.4), 3 * math.sin(0.4), -9.8073])
+    receiver = msgspec.structs.replace(WHITE, stamp_sigma_ms=10.0)
+    row = padded(gnss_position.values(FIX, receiver))
+    north, east, _ = common_of(gnss_position.observe, state, row, gnss_position.parameters(receiver))
+    assert math.hypot(north, east) == pytest.approx(0.2)
+    row[STAMP_ERROR] = 0.03
+    north, east, _ = common_of(gnss_position.observe, state, row, gnss_position.parameters(receiver))
+    assert math.hypot(north, east) == pytest.approx(math.hypot(0.2, 0.6))
+    assert math.atan2(east, north) == pytest.approx(0.4)
+    row = padded(gnss_velocity.values(GnssVelocity(20.0, 0.0), GNSS))
+    row[STAMP_ERROR] = 0.03
+    across = common_of(gnss_velocity.observe, state, row, gnss_velocity.parameters(GNSS))
+    assert np.hypot(*across) == pytest.approx(0.09, rel=1e-3)
+    row = padded(wheel_speed.values(WheelSpeed(20.0), WHEEL))
+    plain = found(wheel_speed.observe, state, row, wheel_speed.parameters(WHEEL)).variance[0]
+    row[STAMP_ERROR] = 0.03
+    wide = found(wheel_speed.observe, state, row, wheel_speed.parameters(WHEEL)).variance[0]
+    assert wide - plain == pytest.approx(0.09**2, rel=2e-3)
+
+
+def test_an_unsigned_wheel_that_is_told_its_direction() -> None:
+    state = bend(-1.0, 0.0)
+    for reading, innovation in ((WheelSpeed(-1.0, signed=True), 0.0), (WheelSpeed(1.0, signed=True), 2.0)):
+        row = padded(wheel_speed.values(reading, WHEEL))
+        seen = found(wheel_speed.observe, state, row, wheel_speed.parameters(WHEEL))
+        assert seen.innovation == pytest.approx([innovation], abs=1e-9)
+        assert seen.variance == pytest.approx([WHEEL.sigma_mps**2])
