@@ -36,7 +36,10 @@ def times(mat: Matrix3, v: Vector3) -> Vector3:
 @compiled
 def inner(a: Vector3, b: Vector3) -> float:
     """Inner product of two vectors (3,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    total = 0.0
+    for i in range(3):
+        total += a[i] * b[i]
+    return total
 
 
 @compiled

@@ -124,7 +124,12 @@ cdef void rotation_times(double* mat, double* v, double* out) noexcept nogil:
     return
 
 cdef double rotation_inner(double* a, double* b) noexcept nogil:
-    return (((a[0] * b[0]) + (a[1] * b[1])) + (a[2] * b[2]))
+    cdef double total
+    cdef int64_t i
+    total = 0.0
+    for i in range(3):
+        total += (a[i] * b[i])
+    return total
 
 cdef void rotation_transposed_times(double* mat, double* v, double* out) noexcept nogil:
     out[0] = (((mat[(0) * 3 + 0] * v[0]) + (mat[(1) * 3 + 0] * v[1])) + (mat[(2) * 3 + 0] * v[2]))
