@@ -19,8 +19,12 @@ from fusiond.filter.state import (
     POSITION,
     SCALE,
     SLIP_ERROR,
+    STEERING_FACTOR_ERROR,
+    STEERING_OFFSET_ERROR,
+    UNDERSTEER_ERROR,
     VELOCITY,
     WIDE_SIZE,
+    YAW_RATE_OFFSET_ERROR,
 )
 from tests.helpers.streams import config
 
@@ -109,3 +113,22 @@ def test_the_slip_is_learnt_where_the_delay_of_the_inertial_sensor_is() -> None:
         sigmas[CALIBRATIONS : params.size] = np.sqrt(params.calibration_variances)
         assert sigmas[INERTIAL_DELAYS_ERROR] == pytest.approx([sigma_ms * 1e-3] * 2)
         assert sigmas[SLIP_ERROR] == pytest.approx([learnt])
+
+
+def test_the_offsets_of_the_car_are_states_where_it_tells_of_itself() -> None:
+    sensor = {"bus": "bus", "signal": "m.s"}
+    steering = {"wheelbase_m": 2.7, "ratio": 16.0, "offset_sigma_deg": 8.0, "factor_sigma": 0.2}
+    params = make_parameters(
+        config(
+            yaw_rate={"esc": {"offset_sigma_deg_s": 2.0} | sensor},
+            steering={"wheel": steering | sensor},
+        )
+    )
+    sigmas = np.zeros(WIDE_SIZE)
+    sigmas[CALIBRATIONS:] = np.sqrt(params.calibration_variances)
+    assert sigmas[YAW_RATE_OFFSET_ERROR] == pytest.approx([math.radians(2.0)])
+    assert sigmas[STEERING_OFFSET_ERROR] == pytest.approx([math.radians(0.5)])  # of the road wheels
+    assert sigmas[STEERING_FACTOR_ERROR] == pytest.approx([0.2])
+    assert sigmas[UNDERSTEER_ERROR] == pytest.approx([math.radians(0.3)])
+    without = {"esc": {"offset_sigma_deg_s": 0.0} | sensor}
+    assert make_parameters(config(yaw_rate=without)).size == WIDE_SIZE  # the model has a place for it all the same

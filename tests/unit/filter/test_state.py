@@ -33,12 +33,14 @@ from tests.helpers.streams import bits, running_state
 NOMINAL = (
     "POSITION_E", "VELOCITY_E", "QUATERNION_EB", "GYRO_BIAS_B", "ACCEL_BIAS_B", "WHEEL_SCALE", "MOUNT", "GNSS_ERROR_E",
     "FURTHER_SCALES", "ANTENNA_B", "DELAYS", "HEIGHT_OFFSET", "INERTIAL_DELAYS", "SLIP",
+    "YAW_RATE_OFFSET", "STEERING_OFFSET", "STEERING_FACTOR", "UNDERSTEER",
 )  # fmt: skip
 ERROR = (
     "POSITION", "VELOCITY", "ATTITUDE", "GYRO_BIAS", "ACCEL_BIAS", "SCALE", "MOUNT_ERROR", "GNSS_ERROR",
     "FURTHER_SCALES_ERROR", "ANTENNA_ERROR", "DELAYS_ERROR", "HEIGHT_OFFSET_ERROR", "INERTIAL_DELAYS_ERROR", "SLIP_ERROR",
+    "YAW_RATE_OFFSET_ERROR", "STEERING_OFFSET_ERROR", "STEERING_FACTOR_ERROR", "UNDERSTEER_ERROR",
 )  # fmt: skip
-WIDTHS = (3, 3, 3, 3, 3, 1, 2, 3, 3, 3, 2, 1, 2, 1)  # of the error states
+WIDTHS = (3, 3, 3, 3, 3, 1, 2, 3, 3, 3, 2, 1, 2, 1, 1, 1, 1, 1)  # of the error states
 
 
 def test_each_error_state_has_its_place_behind_the_one_before() -> None:
