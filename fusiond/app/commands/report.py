@@ -9,6 +9,7 @@ from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import rate
 from fusiond.app.commands.arguments import add_config_and_logs, taken_config
 from fusiond.app.commands.replayed import add_circumstances, circumstances
+from fusiond.app.diagnosis.finding import exit_code, lines
 from fusiond.app.replay.job import Options, replay
 from fusiond.config import load as config
 
@@ -45,8 +46,8 @@ def tiles(text: str) -> str:
     return text
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command; returns the exit code."""
     name = taken_config(arguments)
     loaded = config.load(name)
     options = Options(
@@ -59,5 +60,8 @@ def run(arguments: argparse.Namespace) -> None:
         **circumstances(arguments, loaded),
     )
     with config.located(name):
-        replay(options)
+        summary = replay(options)
     print(f"{arguments.out}  {arguments.out.stat().st_size / 1e6:.1f} MB")
+    for line in lines(summary.findings):
+        print(line)
+    return exit_code(summary.findings)

@@ -42,8 +42,12 @@ MODELS: Mapping[str, tuple[str, str, tuple[str, ...], float]] = {  # model: what
     "wheel_speed": ("speed", "m/s", ("speed",), 1.0),
     "barometric_height": ("height", "m", ("height",), 1.0),
     "gnss_yaw": ("yaw", "deg", ("yaw",), math.degrees(1.0)),
+    "yaw_rate": ("yaw rate", "deg/s", ("clockwise",), math.degrees(1.0)),
+    "steering": ("steering angle", "deg", ("to the right",), math.degrees(1.0)),
+    "lateral_acceleration": ("lateral acceleration", "m/s²", ("to the right",), 1.0),
+    "parked": ("velocity while parked", "m/s", ("x", "y", "z"), 1.0),
 }
-UNITS = {"deg": "deg", "m": "m", "ms": "ms", "mps2": "deg per m/s²"}  # last part of a calibration's name
+UNITS = {"deg": "deg", "m": "m", "ms": "ms", "mps2": "deg per m/s²", "s": "deg/s"}  # last part of a calibration's name
 LEAST_NIS = 0.01  # an axis of logarithms ends there
 LOG_FROM = 30.0  # an axis of sigmas is logarithmic where the largest is this many times the least
 
@@ -337,4 +341,4 @@ def _words(name: str) -> str:
     """A calibration's name for people, without its unit."""
     parts = name.split("_")
     kept = parts[:-1] if parts[-1] in UNITS else parts
-    return " ".join(kept).removesuffix(" deg per").capitalize()
+    return " ".join(kept).removesuffix(" per").removesuffix(" deg").capitalize()

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 pytest.importorskip("bokeh", reason="needs the extra report")
 
 from fusiond import __main__ as entry
+from fusiond.app.diagnosis.finding import NO_STATE, Finding
 from fusiond.app.replay.files import truth_of
 from fusiond.app.replay.replay import Replay, ReplayTask
 from fusiond.app.replay.trace import Trace
+from fusiond.app.report import figures
 from fusiond.app.report.gathered import Gathered
 from fusiond.app.report.page import Report, html
+from fusiond.filter.observations import MODELS as OBSERVATIONS
 from fusiond.messages.info import info_message
 from fusiond_adapters.logs.merge import open_logs
 from tests.helpers import drive
@@ -68,16 +73,29 @@ def test_without_a_truth_it_shows_sigmas_and_says_so() -> None:
     assert f"{made.summary.sources['rear_left'].fused}</td>" in page
 
 
+def test_what_doctor_finds_stands_at_the_top() -> None:
+    made = report(compared=False)
+    text, key = "wheels read 3.6 times the speed", "wheel.a.unit"
+    wrong = Finding(kind="wheel_unit", text=text, key=key, place="c.toml:7", value='"km/h"')
+    page = html(replace(made, summary=msgspec.structs.replace(made.summary, findings=[wrong])))
+    assert page.index("Wheels read 3.6 times the speed") < page.index('<section id="track"')
+    assert "c.toml:7: <code>wheel.a.unit = &#34;km/h&#34;</code>" in page
+
+
 def test_without_a_state_it_says_so(tmp_path: Path) -> None:
     """Half a second is too short to start."""
     tlog = tmp_path / "drive.tlog"
     tlog.write_bytes((drive.folder() / "drive.tlog").read_bytes()[:6000])
     out = tmp_path / "drive.html"
     arguments = ["report", "--config", str(drive.folder() / "fusiond.toml"), str(tlog), "-o", str(out)]
-    assert entry.main(arguments) == 0
+    assert entry.main(arguments) == NO_STATE
     page = out.read_text(encoding="utf-8")
-    assert "There was no state at any time" in page and "No state" in page
+    assert "There was no state at any time" in page and '<p class="finding no_state"><b>Found</b>' in page
     assert "Nothing was received from front_left" in page
+
+
+def test_every_kind_of_measurement_has_its_unit() -> None:
+    assert set(figures.MODELS) == {model.name for model in OBSERVATIONS}
 
 
 def test_tiles_open_their_server_and_nothing_else() -> None:
