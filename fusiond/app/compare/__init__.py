@@ -1,0 +1,1 @@
+"""Two tracks of one drive, compared."""
