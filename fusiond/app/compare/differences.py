@@ -210,7 +210,7 @@ def _lines(found: Differences) -> Iterator[str]:
     yield ""
     if not found.apart:
         yield f"nowhere further apart than {APART:g} sigmas, and always in the same mode"
-    for one in found.apart[:SHOWN]:
-        yield f"{one.start_s:.1f} to {one.stop_s:.1f} s: {one.what}: {one.most}"
+    for stretch in found.apart[:SHOWN]:
+        yield f"{stretch.start_s:.1f} to {stretch.stop_s:.1f} s: {stretch.what}: {stretch.most}"
     if len(found.apart) > SHOWN:
         yield f"and {len(found.apart) - SHOWN} more stretches"

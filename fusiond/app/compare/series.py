@@ -1,9 +1,8 @@
-"""A track as arrays: of a CSV file, of a replay with a configuration, or the autopilot's own in a log."""
+"""A track as arrays: of a CSV file, or of a replay with a configuration."""
 
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,6 @@ from fusiond_adapters.logs.merge import open_logs
 
 NUMBERS = CSV_COLUMNS[1:-1]
 COUNT = len(NUMBERS)
-NO_SIGMAS = 5  # columns of sigmas, at the end
 
 
 class SeriesError(UnusableError):
@@ -90,16 +88,3 @@ def of_replay(name: str, config: Config, logs: Sequence[str], rate_hz: float | N
 
     Replay(config, ReplayTask(rate_hz or config.publish.rate_hz, on_tick=[add])).run(open_logs(logs, config))
     return Series.of(name, t_ns, numbers, modes)
-
-
-def of_autopilot(path: str) -> Series:
-    """What the autopilot held for true, in its log. It has no sigmas. Raises LogError."""
-    from fusiond_adapters.logs.own_estimate import own_estimate  # noqa: PLC0415 - only where it is asked for
-
-    t_ns, numbers = list[int](), list[tuple[float, ...]]()
-    for state in own_estimate(path):
-        t_ns.append(state.t_ns)
-        place = math.degrees(state.latitude), math.degrees(state.longitude), state.height
-        unknown = (math.nan,) * NO_SIGMAS
-        numbers.append((*place, *state.velocity_n, math.nan, math.nan, math.degrees(state.yaw), *unknown))
-    return Series.of(f"the autopilot's own in {path}", t_ns, numbers, [""] * len(t_ns))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from msgspec.structs import replace
 
 from fusiond.config.schema import Config
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
@@ -35,19 +36,28 @@ class LogSeries:
     readings: dict[str, Readings] = field(default_factory=dict)
     origin_ns: int = 0
     seconds: float = 0.0
+    delays: dict[str, int] = field(default_factory=dict)  # by source [ns]: those that stamps were aligned with
     first: tuple[Array, Array] | None = None  # of the first fix: axes north-east-down (3, 3), and place, earth-fixed [m]
+
+    def under(self, config: Config) -> Iterator[Measurement]:
+        """The events, aligned with the delays of another configuration; sources that it does not have are left out."""
+        by = {source: found.delay_ns - self.delays.get(source, 0) for source, found in config.streams().items()}
+        for event in self.events:
+            if (later := by.get(event.source)) is not None:
+                yield event if later == 0 else replace(event, t_ns=event.t_ns - later)
 
 
 def read_series(logs: Sequence[str], config: Config) -> LogSeries:
     """Read logs. Raises LogError."""
-    clock, found = Clock(config), LogSeries()
+    clock, found = Clock(config), LogSeries(delays={name: one.delay_ns for name, one in config.streams().items()})
     rows: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
     for event in open_logs(logs, config):
         measurement = clock.align(event)
         if measurement is None:
             continue
         found.events.append(measurement)
-        payload, numbers = measurement.payload, None
+        payload = measurement.payload
+        numbers: tuple[float, ...] = ()
         if isinstance(payload, ImuSample):
             numbers = payload.specific_force_b + payload.angular_rate_b
         elif isinstance(payload, GnssPosition):
@@ -59,7 +69,7 @@ def read_series(logs: Sequence[str], config: Config) -> LogSeries:
             numbers = (payload.north, payload.east, payload.down or 0.0)
         elif isinstance(payload, WheelSpeed):
             numbers = (payload.speed,)
-        if numbers is not None:
+        if numbers:
             rows.setdefault(measurement.source, []).append((measurement.t_ns, numbers))
     if found.events:
         found.origin_ns = min(measurement.t_ns for measurement in found.events)

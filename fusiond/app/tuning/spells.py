@@ -64,8 +64,7 @@ def _ends(config: Config, log: LogSeries, begin_s: float, end_s: float, length_s
     fusion, ends = Fusion(config), list[_End]()
     last: Measurement | None = None  # withheld fix
     within = -1
-    streams = config.streams()
-    for event in log.events:
+    for event in log.under(config):
         if isinstance(event.payload, GnssPosition | GnssVelocity):
             since = (event.t_ns - log.origin_ns) * 1e-9
             spell = int((since - begin_s) // length_s) if begin_s <= since < end_s else -1
@@ -76,7 +75,7 @@ def _ends(config: Config, log: LogSeries, begin_s: float, end_s: float, length_s
             whole = begin_s + (spell + 1) * length_s <= end_s
             if spell >= 0 and spell % 2 == phase and whole:
                 within = spell
-                if isinstance(event.payload, GnssPosition) and event.source in streams:
+                if isinstance(event.payload, GnssPosition):
                     last = event
                 continue
         fusion.fuse(event)

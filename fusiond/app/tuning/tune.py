@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from fusiond.app.replay.summary import table
 from fusiond.app.tuning import methods
@@ -34,6 +35,7 @@ from fusiond.units import SECOND
 
 MOVING = 1.0  # m/s, from which on the road shakes the inertial sensor
 LONGEST_LAG = 40.0  # s, of structure functions
+STRANGE = 4.0  # of the sigma before: a calibration further off is not that, but another error
 TOLD = 0.5  # of the sigma before: an installation value whose sigma the smoother did not bring below is not told
 OPENED = {"delay_sigma_ms": 100.0, "velocity_delay_sigma_ms": 100.0, "lever_arm_sigma_m": 0.5}  # of a receiver, to learn
 IMU_DELAY_MS = 20.0  # the same of the inertial sensor
@@ -174,7 +176,7 @@ def _inertial(config: Config, log: LogSeries, half: float) -> Iterator[Finding]:
         yield _finding(INERTIAL, f"imu.{name}", key, label, getattr(unit, key), found)
 
 
-def _moving(config: Config, log: LogSeries, t: Array) -> Array:
+def _moving(config: Config, log: LogSeries, t: Array) -> NDArray[np.bool_]:
     """Whether the vehicle moves at each instant, by GNSS velocities and wheels; everywhere where there are none."""
     for source in [*(f"{name}.velocity" for name in config.gnss), *config.wheel]:
         readings = log.readings.get(source)
@@ -220,6 +222,8 @@ def _positions(
     fit = methods.fit_slow_noise(found, methods.integrated(given, interval, found.lags) if alone else None)
     key = SIGMA_OF_TYPE.get(int(np.median(values[:, 4])), "position_sigma_m")
     sigma = fit.sigma
+    if fit.time.untold and fit.noise.slow > fit.noise.white:
+        sigma = sigma._replace(untold="it cannot be told from what drifts")
     if (values[:, 3] > getattr(gnss, key)).mean() > 0.5:
         sigma = sigma._replace(untold="the receiver tells its own, which is larger")
     yield _finding(RECEIVER, f"gnss.{name}", key, "m", getattr(gnss, key), sigma)
@@ -264,7 +268,8 @@ def _velocities(
         sigma, time = sigma._replace(untold=vague), time._replace(untold=vague)
     share = fit.noise.slow / (fit.noise.slow + fit.noise.white) if fit.noise.slow > 0 else 0.0
     alike = time._replace(value=time.value * share, sigma=time.sigma * share)
-    late = Estimate(gnss.velocity_delay_ms + 1e3 * lag.value, 1e3 * lag.sigma, lag.untold)
+    moved = tuned.gnss[name].delay_ms - gnss.delay_ms  # the velocity's delay counts from the position's
+    late = Estimate(gnss.velocity_delay_ms + 1e3 * lag.value - moved, 1e3 * lag.sigma, lag.untold)
     if not late.untold and late.sigma > VAGUE_MS:
         late = late._replace(untold="too few changes of speed")
     found = [
@@ -317,14 +322,18 @@ def _installation(config: Config, tuned: Config, log: LogSeries, half: float) ->
     first = FilterState(len(fusion.params.sources), fusion.params.size)
     first.covariance[CALIBRATIONS:, CALIBRATIONS:] = np.diag(fusion.params.calibration_variances)
     before = calibrations(fusion.params, first)
-    for what, (value, sigma) in calibrations(fusion.params, learnt).items():
+    found = calibrations(fusion.params, learnt)
+    odd = [what for what, (value, _) in found.items() if abs(value) > STRANGE * before[what][1]]
+    doubt = f"{odd[0]} would be {found[odd[0]][0]:.3g}: something else is wrong" if odd else ""
+    for what, (value, sigma) in found.items():
         if what != "velocity_delay_ms":  # it is told by how late velocities are
-            yield _calibration(config, tuned, name, what, Estimate(value, sigma), before[what][1])
+            yield _calibration(config, tuned, name, what, Estimate(value, sigma, doubt), before[what][1])
 
 
 def _calibration(config: Config, tuned: Config, name: str, what: str, learnt: Estimate, before: float) -> Finding:
     """What the smoother says of one calibration. Delay and lever arm have keys; the others are learnt in each drive."""
-    untold = "" if learnt.sigma < TOLD * before else f"the sigma only fell from {before:.2g} to {learnt.sigma:.2g}"
+    same = f"the sigma only fell from {before:.2g} to {learnt.sigma:.2g}"
+    untold = learnt.untold or ("" if learnt.sigma < TOLD * before else same)
     configured, now = config.gnss[name], tuned.gnss[name]
     where, given, base = f"gnss.{name}", 0.0, 0.0
     if what == "delay_ms":
@@ -363,7 +372,7 @@ def _smoothed(
     fusion = Fusion(config)
     archive = Archive(fusion.params, Spool.in_memory())
     fusion.history.archive = archive.add
-    for event in log.events:
+    for event in log.under(config):
         if event.source != without and _since(log, event.t_ns) < half:
             fusion.fuse(event)
     fusion.history.finish()

@@ -1,4 +1,4 @@
-"""fusiond compare: of two configurations, of two files, with the autopilot's own; and what cannot be compared."""
+"""fusiond compare: of two configurations, of two files; and what cannot be compared."""
 
 from __future__ import annotations
 
@@ -113,10 +113,10 @@ def test_a_configuration_and_its_own_track(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ([], "give one or two configurations or tracks"),
-        (["a.csv", "b.csv", "c.csv"], "give one or two configurations or tracks (.toml, .csv), not 3"),
+        ([], "give two configurations or tracks"),
+        (["a.csv", "b.csv", "c.csv"], "give two configurations or tracks (.toml, .csv), not 3"),
         (["a.toml", "b.csv"], "give the logs of the drive as well"),
-        (["a.csv"], "give the logs of the drive as well"),
+        (["a.csv"], "give two configurations or tracks (.toml, .csv), not 1"),
     ],
 )
 def test_what_cannot_be_compared(files: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
