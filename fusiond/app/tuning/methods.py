@@ -112,6 +112,9 @@ def fit_slow_noise(found: Structure, known: Array | None = None) -> SlowFit:
     misfits = np.array([misfit for misfit, _, _ in tried])
     best = int(np.argmin(misfits))
     misfit, white, slow = tried[best]
+    if misfit == math.inf:
+        hidden = Estimate(0.0, math.inf, "what drifts hides it")
+        return SlowFit(SlowNoise(0.0, 0.0, 0.0), hidden, hidden)
     scale = max(misfit / max(len(found.lags) - 3, 1), 1.0)
     likely = np.flatnonzero(misfits < misfit + 4 * scale)  # two sigmas; neighbouring lags share their data
     time, low, high = float(times[best]), float(times[likely[0]]), float(times[likely[-1]])

@@ -86,6 +86,13 @@ def test_what_the_velocity_errors_make_of_the_path_is_known() -> None:
     np.testing.assert_allclose(found.values, expected, rtol=0.25)
 
 
+def test_what_is_known_may_hide_the_rest() -> None:
+    t = STEP * np.arange(3000)
+    found = structure(t, np.random.default_rng(9).normal(size=(3000, 2)), 1.0, 40.0)
+    fit = fit_slow_noise(found, found.values + found.lags)
+    assert fit.sigma.untold == fit.time.untold == "what drifts hides it"
+
+
 def test_gaps_have_no_lags() -> None:
     t = np.concatenate([np.arange(0, 50, STEP), np.arange(1000, 1050, STEP)])
     found = structure(t, np.zeros((len(t), 2)), 1.0, 100.0)
