@@ -22,10 +22,23 @@ from fusiond.app.batch.page import page
 from fusiond.app.batch.row import Row
 from fusiond.app.batch.store import Cost, Store
 from fusiond.app.batch.table import read_rows, write_rows
+from fusiond.app.batch.tune import (
+    FOLDS,
+    SHARED,
+    FleetFinding,
+    by_vehicle,
+    joined,
+    text_with,
+    write_fold,
+    write_vehicles,
+)
 from fusiond.app.replay.files import delivering
+from fusiond.app.tuning.tune import Finding
+from fusiond.config.toml import read_text
 from fusiond.errors import UnusableError, UsageError
 
-NEW, BASELINE = "new", "baseline"  # roles
+NEW, BASELINE, TUNED = "new", "baseline", "tuned"  # roles
+VEHICLES = "vehicles.parquet"  # what is each vehicle's own
 OWN = "own"  # in place of a configuration: the one that lies beside each drive
 DRAWN_S = 0.2  # between two drawings of the progress
 ROWS, SUMMARY, TRACKS, REPORTS = "rows.parquet", "summary.html", "tracks", "reports"
@@ -121,6 +134,76 @@ def _measure(store: Store, engine: Engine, left: int, progress: TextIO) -> None:
     with _Progress(left, progress) as shown:
         for key, answer in engine.answers(pending()):
             store.put(key, _row(jobs.pop(key), answer), answer.cpu_s, answer.peak_mb)
+            shown.step()
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """What a fleet tells of its configuration, and how that does on drives that did not tell it."""
+
+    drives: int
+    asked: int  # of these, that told something
+    findings: list[FleetFinding]
+    dropped: dict[str, Findings]  # groups that made other drives worse, and how; they are not taken
+    judged: Findings  # of those that are taken, against the configuration given
+    text: str  # of the new configuration
+
+
+def tune(order: Order, engine: Engine, progress: TextIO = sys.stderr) -> Tuned:
+    """Tune a configuration by all drives, judged by others than told it. Raises UsageError, UnusableError, OutputError."""
+    with Store(order.folder) as store:
+        plan(order, store)
+        _ask(store, engine, progress)
+        told = [(drive, store.told(key) or []) for drive, key, _ in store.jobs(NEW)]
+        _measure(store, engine, store.left(), progress)
+        best, taken, dropped = NEW, list[str](), dict[str, Findings]()
+        for group in SHARED:
+            if not any(one.differs for one in joined((found for _, found in told), [group])):
+                continue
+            role = f"{TUNED} {group}"
+            _plan_folds(order, store, role, told, [*taken, group])
+            _measure(store, engine, store.left(), progress)
+            judged = gather(store.rows(role), store.rows(best))
+            if judged.comparison is not None and judged.comparison.is_worse:
+                dropped[group] = judged
+            else:
+                best, taken = role, [*taken, group]
+        vehicles = {drive: row.vehicle for drive, _, row in store.rows(NEW)}
+        own = by_vehicle((vehicles.get(drive, ""), found) for drive, found in told)
+        with delivering(order.folder / VEHICLES):
+            write_vehicles(order.folder / VEHICLES, own)
+        text = text_with(read_text(Path(order.config)), joined((found for _, found in told), taken))
+        findings = joined(found for _, found in told)
+        asked = sum(bool(found) for _, found in told)
+        return Tuned(len(told), asked, findings, dropped, gather(store.rows(best), store.rows(NEW)), text)
+
+
+def _plan_folds(
+    order: Order, store: Store, role: str, told: Sequence[tuple[str, list[Finding]]], groups: Sequence[str]
+) -> None:
+    """Plan each drive by a configuration with what the drives of the other folds tell of some groups."""
+    files, digests = list[Path](), list[str]()
+    for fold in range(FOLDS):
+        others = (found for number, (_, found) in enumerate(told) if number % FOLDS != fold)
+        files.append(order.folder / "folds" / f"{role.replace(' ', '-')}-{fold}.toml")
+        with delivering(files[-1]):
+            write_fold(order.config, joined(others, groups), files[-1])
+        digests.append(keys.of_configuration(str(files[-1])))
+    for number, (drive, _, job) in enumerate(list(store.jobs(NEW))):
+        fold = number % FOLDS
+        key = keys.of_row(job.drive, digests[fold], order.options)
+        store.plan(role, drive, key, replace(job, config=str(files[fold].absolute())))
+
+
+def _ask(store: Store, engine: Engine, progress: TextIO) -> None:
+    """Ask every drive that was not asked yet what it says of the configuration."""
+    left = [key for _, key, _ in store.jobs(NEW) if store.told(key) is None]
+    wanted = set(left)
+    jobs = ((key, replace(job, tune=True)) for _, key, job in list(store.jobs(NEW)) if key in wanted)
+    with _Progress(len(left), progress) as shown:
+        for key, answer in engine.answers(jobs):
+            if answer.status == "ok":
+                store.put_told(key, answer.told)
             shown.step()
 
 

@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from fusiond import __version__
 from fusiond.app.batch.row import Row, Status
+from fusiond.app.tuning.tune import Finding
 
 
 class DriveFile(Struct, frozen=True, kw_only=True):
@@ -65,6 +66,7 @@ class Job(Struct, frozen=True, kw_only=True):
     limits: Limits
     smoothed_by: str | None = None  # where there is no truth: the configuration of the smoother to compare with; None: none
     track: str = ""  # file to write the track to; empty: none
+    tune: bool = False  # tell what the drive says of the configuration, instead of anything else
     report: str = ""  # file to write the report to, instead of anything else; empty: none
 
     def known(self) -> dict[str, Any]:
@@ -78,6 +80,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     """What became of a job: its row, or how the process ended without one; and what it cost, which is in no row."""
 
     row: Row | None = None
+    told: list[Finding] = []  # of a job that tunes
     status: Status = "ok"
     reason: str = ""
     cpu_s: float = 0.0

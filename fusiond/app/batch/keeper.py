@@ -207,9 +207,11 @@ def _work(job: Job, receiver: int, sender: int) -> None:
 
 
 def _measured(job: Job) -> Answer:
-    from fusiond.app.batch.measure import measure  # noqa: PLC0415 - imported already
+    from fusiond.app.batch.measure import measure, tell  # noqa: PLC0415 - imported already
 
     try:
+        if job.tune:
+            return Answer(told=tell(job))
         return Answer(row=measure(job))
     except MemoryError:
         return _ended("out of memory", f"more than {job.limits.memory_mb:g} MB")

@@ -23,6 +23,7 @@ from fusiond.app.replay.replay import WHOLE, Replay, ReplayTask
 from fusiond.app.replay.smoothed import Smoothing
 from fusiond.app.replay.summary import Summary
 from fusiond.app.replay.truth import Truth, TruthSample
+from fusiond.app.tuning.tune import Finding, tune
 from fusiond.config import load
 from fusiond.config.schema import Config
 from fusiond.errors import UnusableError, UsageError
@@ -35,6 +36,15 @@ from fusiond_adapters.logs.merge import LogSet, open_logs
 
 class NoTrack(UnusableError):
     """The logs were read, and gave no state; the message says why."""
+
+
+def tell(job: Job) -> list[Finding]:
+    """What a drive says of the configuration; nothing if it cannot be used."""
+    try:
+        with _at_hand(job.drive) as files:
+            return _Measurement(job, files, job.known()).told()
+    except (UnusableError, UsageError, OSError):
+        return []  # the row of the drive says why
 
 
 def measure(job: Job) -> Row:
@@ -123,6 +133,11 @@ class _Measurement:
         if not path and own is None:
             raise UnusableError("no configuration lies beside the logs, and none was given")
         return load.load(path or self._files[own.name if own else ""])
+
+    def told(self) -> list[Finding]:
+        """What the drive says of the configuration."""
+        found = tune(Path(self._job.config), self._paths()).findings
+        return [one for one in found if math.isfinite(one.found) and math.isfinite(one.sigma)]  # an answer is JSON
 
     def reported(self) -> Row:
         """Write the report of the drive."""

@@ -16,6 +16,7 @@ import msgspec
 
 from fusiond.app.batch.job import Job, Limits
 from fusiond.app.batch.row import Row
+from fusiond.app.tuning.tune import Finding
 from fusiond.errors import OutputError, UnusableError
 
 NAME = "batch.sqlite"
@@ -25,6 +26,7 @@ create table if not exists plan (
 create index if not exists plan_key on plan (key);
 create table if not exists rows (
   key text primary key, status text, limits text, row blob, cpu_s real, peak_mb real) without rowid;
+create table if not exists told (key text primary key, findings blob) without rowid;
 create temp table todo (number integer primary key, key text);
 """
 AT_ONCE = 256  # keys of the plan that are read together
@@ -125,6 +127,21 @@ class Store:
         )
         for drive, key, row in found:
             yield drive, key, msgspec.json.decode(row, type=Row)
+
+    def jobs(self, role: str) -> Iterator[tuple[str, str, Job]]:
+        """Drive, key and job of a role, by the names of the drives."""
+        found = self._base.cursor().execute("select drive, key, job from plan where role = ? order by drive", (role,))
+        for drive, key, job in found:
+            yield drive, key, msgspec.json.decode(job, type=Job)
+
+    def put_told(self, key: str, findings: list[Finding]) -> None:
+        """Keep what a drive has told, for good."""
+        self._base.execute("insert or replace into told values (?, ?)", (key, msgspec.json.encode(findings)))
+
+    def told(self, key: str) -> list[Finding] | None:
+        """What the drive with a key has told; None: it was not asked yet."""
+        found = self._base.execute("select findings from told where key = ?", (key,)).fetchone()
+        return None if found is None else msgspec.json.decode(found[0], type=list[Finding])
 
     def job(self, role: str, drive: str) -> Job:
         """The job of a drive."""

@@ -43,6 +43,11 @@ def _lines(found: Findings) -> Iterator[str]:
 HEADS = ["drive", "figure", "baseline", "new", "ratio"]
 
 
+def compared(found: Findings) -> str:
+    """Only the comparison."""
+    return "\n".join(_comparison(found.comparison, found.unpaired)) if found.comparison else ""
+
+
 def _medians(found: Findings) -> Iterator[tuple[str, str, str, str]]:
     for name, values in found.values.items():
         middle = sorted(values["new"])[len(values["new"]) // 2]

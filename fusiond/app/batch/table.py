@@ -44,6 +44,11 @@ def _fields(kind: type[msgspec.Struct]) -> Iterator[pa.Field]:
         yield pa.field(item.name, arrow_type(item.type))
 
 
+def schema_of(kind: type[msgspec.Struct]) -> pa.Schema:
+    """The columns of a struct."""
+    return pa.schema(list(_fields(kind)))
+
+
 SCHEMA = pa.schema([pa.field("drive", pa.string()), pa.field("key", pa.string()), *_fields(Row)])
 
 

@@ -10,10 +10,13 @@ from fusiond.app.batch.batch import OWN, ROWS, SUMMARY, Order
 from fusiond.app.batch.engines import Cluster, Engine, LocalPool, cores
 from fusiond.app.batch.findings import WORST
 from fusiond.app.batch.job import Limits, Options
-from fusiond.app.batch.summary import text
+from fusiond.app.batch.summary import compared, text
+from fusiond.app.batch.tune import lines
 from fusiond.app.commands import EXIT_CODES
 from fusiond.app.commands.argument_types import count, positive, rate, seed
+from fusiond.app.replay.files import check_outputs, delivering
 from fusiond.app.replay.outages import parse_length
+from fusiond.errors import UsageError
 
 WORSE = 3  # exit code
 
@@ -56,6 +59,7 @@ def fill(parser: argparse.ArgumentParser) -> None:
     add("--scheduler", metavar="URL", help="the scheduler of a Dask cluster, such as tcp://HOST:8786 (extra `dask`)")
     add("--seconds", metavar="S", type=positive, default=600.0, help="processor time of one drive; default: %(default)g")
     add("--memory", metavar="MB", type=positive, default=2000.0, help="memory of one drive; default: %(default)g")
+    add("--tune", metavar="TUNED.toml", type=Path, help="tune NEW by all drives, each judged by what others told")
     add("--dry-run", action="store_true", help="tell what would be done")
 
 
@@ -72,6 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         print(batch.dry(order))
         return 0
+    if arguments.tune:
+        return _tune(order, arguments)
     with _engine(arguments) as engine:
         result = batch.run(order, engine)
     print(text(result.findings))
@@ -81,6 +87,24 @@ def run(arguments: argparse.Namespace) -> int:
         f" the largest {cost.peak_mb:.0f} MB\n{order.folder / ROWS}\n{order.folder / SUMMARY}"
     )
     return WORSE if result.findings.comparison is not None and result.findings.comparison.is_worse else 0
+
+
+def _tune(order: Order, arguments: argparse.Namespace) -> int:
+    """Tune one configuration by all drives."""
+    if order.config == OWN or order.baseline is not None:
+        raise UsageError("--tune needs one configuration by --config, and no baseline: it is compared with itself")
+    check_outputs([arguments.tune], [Path(order.config)])
+    with _engine(arguments) as engine:
+        tuned = batch.tune(order, engine)
+    print(f"{tuned.asked} of {tuned.drives} drives tell something\n")
+    print("\n".join(lines(tuned.findings, tuned.dropped)))
+    for group, judged in tuned.dropped.items():
+        print(f"\n{group}: not taken, because drives that did not tell it get worse\n{compared(judged)}")
+    print(f"\nwhat is taken, on drives that did not tell it\n{compared(tuned.judged)}")
+    with delivering(arguments.tune):
+        arguments.tune.write_text(tuned.text, encoding="utf-8")
+    print(f"\n{arguments.tune}\n{order.folder / batch.VEHICLES}: what is each vehicle's own")
+    return 0
 
 
 def _engine(arguments: argparse.Namespace) -> Engine:
