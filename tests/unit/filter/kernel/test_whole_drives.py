@@ -12,7 +12,20 @@ import pytest
 
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Fusion
-from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, Measurement, Payload, Pressure, WheelSpeed
+from fusiond.events import (
+    GnssPosition,
+    GnssVelocity,
+    GnssYaw,
+    ImuSample,
+    LateralAcceleration,
+    Measurement,
+    Parked,
+    Payload,
+    Pressure,
+    SteeringAngle,
+    WheelSpeed,
+    YawRate,
+)
 from fusiond.filter.rivals import INERTIAL, RECEIVER, RIVALS
 from fusiond.filter.rivals import WHEELS as WHEELS_SLIP
 from fusiond.filter.state import (
@@ -26,10 +39,12 @@ from fusiond.filter.state import (
     PHASE,
     RUNNING,
     SLIP_ERROR,
+    STEERING_OFFSET_ERROR,
     T_START,
     T_STILL,
     VELOCITY_E,
     WIDE_SIZE,
+    YAW_RATE_OFFSET_ERROR,
     FilterState,
     ResetReason,
     Verdict,
@@ -183,6 +198,44 @@ def test_all_that_can_be_learnt() -> None:
     assert sigma[SLIP_ERROR][0] < math.radians(0.5)
     assert fusion.outcomes()["front_left"]["FUSED"] > 40
     assert fusion.outcomes()["yaw0"]["FUSED"] > 10
+
+
+def test_what_the_car_tells_of_itself() -> None:
+    """Yaw rate, steering, lateral acceleration, and a gear lever at park until it pulls away; a hole of the inertial sensor
+    in the bend; stamps by clocks that may be off; a wheel with a direction from elsewhere."""
+    truth = drive(14.0, lambda t: 10.0 * ramp(t, 4.0, 3.0), lambda t: 0.7 + 0.15 * np.clip(t - 7.0, 0.0, None), rate=25.0)
+
+    def change(event: Measurement, t: float) -> Payload | None:
+        if isinstance(event.payload, WheelSpeed):
+            return WheelSpeed(event.payload.speed, signed=t > 6)
+        return None if event.source == "imu0" and 10.0 < t < 11.0 else event.payload
+
+    off = {True: 0.0, False: 0.01}  # s, of the stamps, by whether they are the inertial sensor's
+    events = [
+        msgspec.structs.replace(event, stamp_sigma=off[event.source == "imu0"]) for event in sensed(truth, change)
+    ]
+    for k in range(140):
+        t, t_ns = 0.1 * k, T0 + 3 * MS + k * 100 * MS
+        speed, turn = 10.0 * float(ramp(np.array(t), 4.0, 3.0)), 0.15 * (t > 7.0)
+        angle = 2.7 * turn / speed if speed > 1 else 0.0
+        own = (YawRate(turn + 0.02), SteeringAngle(angle + 0.01), LateralAcceleration(speed * turn), Parked(t < 3.5))
+        names = ("esc", "column", "across", "gear")
+        events += [Measurement(t_ns, name, k, t_ns, payload) for name, payload in zip(names, own, strict=True)]
+    signal: dict[str, Any] = {"bus": "bus", "signal": "m.s"}
+    settings = config(
+        filter=HEADED,
+        yaw_rate={"esc": signal},
+        steering={"column": signal | {"wheelbase_m": 2.7}},
+        lateral_acceleration={"across": signal},
+        parked={"gear": signal},
+    )
+    fusion = both_kernels(settings, sorted(events, key=lambda event: event.key))
+    head = fusion.history.head
+    for block, first, true in ((YAW_RATE_OFFSET_ERROR, math.radians(1.0), 0.02), (STEERING_OFFSET_ERROR, 0.0058, 0.01)):
+        assert math.sqrt(head.covariance[block, block][0, 0]) < 0.7 * first
+        assert head.nominal[block.start + 1] == pytest.approx(true, abs=0.005)
+    outcomes = fusion.outcomes()
+    assert all(outcomes[name]["FUSED"] > 90 for name in ("esc", "column", "across", "gear"))
 
 
 def test_an_imu_that_falls_silent() -> None:
