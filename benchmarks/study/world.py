@@ -88,7 +88,11 @@ class World:
         first = np.zeros(WIDE_SIZE - CALIBRATIONS)
         variances = make_parameters(config).calibration_variances
         first[: len(variances)] = np.sqrt(variances)
-        self.drawn = Drawn(first * random.standard_normal(len(first)))
+        own = YAW_RATE_OFFSET_ERROR.start - CALIBRATIONS  # of the car's sensors: drawn only where it has them
+        first[:own] *= random.standard_normal(own)
+        if first[own:].any():
+            first[own:] *= random.standard_normal(len(first) - own)
+        self.drawn = Drawn(first)
         (unit,) = config.imu.values()
         mount = (0.0, float(np.degrees(self.drawn.mount[0])), float(np.degrees(self.drawn.mount[1])))
         noise = {key: getattr(unit, key) for key in IMU_KEYS}
