@@ -32,13 +32,15 @@ OUTPUTS: Mapping[str, Callable[[Config], bool]] = {  # module: whether the confi
 }
 LOG_FORMATS = (
     LogFormat(".tlog", "MAVLink", "logs.tlog"),
+    LogFormat(".bin", "ArduPilot DataFlash", "logs.dataflash"),
+    LogFormat(".ulg", "PX4 ULog", "logs.ulog"),
     LogFormat(".log", "candump -L", "logs.candump"),
     LogFormat(".asc", "Vector ASC", "logs.python_can"),
     LogFormat(".blf", "Vector BLF", "logs.python_can"),
     LogFormat(".trc", "PEAK TRC", "logs.python_can"),
     LogFormat(".csv", "python-can CSV", "logs.python_can"),
-    LogFormat(".db", "python-can SQLite", "logs.python_can", zipped=False),
-    LogFormat(".mf4", "ASAM MDF 4", "logs.python_can", zipped=False),
+    LogFormat(".db", "python-can SQLite", "logs.python_can"),
+    LogFormat(".mf4", "ASAM MDF 4", "logs.python_can"),
 )
 
 

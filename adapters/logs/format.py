@@ -46,7 +46,6 @@ class LogFormat(NamedTuple):
     suffix: str
     about: str  # name for users
     reader: str
-    zipped: bool = True  # whether a .gz of it can be read too
 
     def open(self, opening: Opening) -> Reading:
         """Import the reader and open a log with it. Raises LogError, ConfigError."""

@@ -18,6 +18,7 @@ from fusiond.sessions import Receipts
 from fusiond.units import SECOND
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
+from fusiond_adapters.logs.guess import guess
 from fusiond_adapters.registry import INPUTS, LOG_FORMATS
 
 READ_AHEAD = 512  # events
@@ -233,15 +234,15 @@ def _open(argument: str, config: Config, sequences: dict[str, int]) -> _Log:
     name, path = _split(argument, config)
     file = LogFile(path)
     for kind in LOG_FORMATS:
-        if kind.suffix == file.suffix and (kind.zipped or not file.zipped):
+        if kind.suffix == file.suffix:
             return _Log(file, kind.open(Opening(file, kind.about, name, config, sequences)))
-    raise LogError(f"{path}: unknown kind of log; known: {_known()}")
+    seems = guess(file)
+    raise LogError(f"{path}: unknown kind of log{f': {seems}' if seems else ''}; known: {_known()}")
 
 
 def _known() -> str:
     known = ", ".join(f"{kind.suffix} ({kind.about})" for kind in LOG_FORMATS)
-    unzipped = " and ".join(kind.suffix for kind in LOG_FORMATS if not kind.zipped)
-    return f"{known}; all but {unzipped} also with .gz"
+    return f"{known}; all also with .gz or .zst"
 
 
 def _split(argument: str, config: Config) -> tuple[str | None, str]:

@@ -11,6 +11,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import can
 from can.io.blf import BLFParseError
@@ -22,6 +23,7 @@ from fusiond_adapters.logs.file import MAX_LINE, BlockStream, LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 
 BINARY = (".blf", ".db", ".mf4")  # the others are text
+FILES = (".db", ".mf4")  # read from a file, not from a stream
 MF4_MAGIC = (b"MDF", b"UnFinMF")
 MAX_ROW, MIN_ROW = 1 << 16, 4  # bytes of a row in a .db
 
@@ -80,10 +82,19 @@ class _Text(io.TextIOWrapper):
 def _messages(log: LogFile) -> Iterator[can.Message]:
     """python-can's messages. After a bad line of a text format, reading continues and loses at most one more line; a binary
     format ends there."""
+    if log.suffix in FILES:
+        with log.unzipped() as path:
+            yield from _messages_at(log, path)
+    else:
+        yield from _messages_at(log, log.path)
+
+
+def _messages_at(log: LogFile, path: Path) -> Iterator[can.Message]:
+    """The same; `path`: of a file that python-can opens itself."""
     text = None if log.suffix in BINARY else _Text(log)
     damage = (*DAMAGE, *_mf4_damage(log)) if log.suffix == ".mf4" else DAMAGE
     try:
-        reader = _open(log, text)
+        reader = _open(log, text, path)
     except damage as error:
         raise LogError(f"{log.path}: is not a {log.suffix} log: {error}") from error
     with reader:
@@ -106,7 +117,7 @@ def _messages(log: LogFile) -> Iterator[can.Message]:
                 return
 
 
-def _open(log: LogFile, text: _Text | None) -> can.io.generic.MessageReader:
+def _open(log: LogFile, text: _Text | None, path: Path) -> can.io.generic.MessageReader:
     """python-can's reader of the format: a text format reads from `text`."""
     if text is not None:
         if log.suffix == ".asc":
@@ -115,20 +126,21 @@ def _open(log: LogFile, text: _Text | None) -> can.io.generic.MessageReader:
     if log.suffix == ".blf":
         return can.BLFReader(io.BufferedReader(BlockStream(checked(log.stream()))))
     if log.suffix == ".db":
-        return _Sqlite(log)
-    with log.path.open("rb") as file:
+        return _Sqlite(log, path)
+    with path.open("rb") as file:
         if not file.read(8).startswith(MF4_MAGIC):  # checked first: asammdf prints to standard error besides raising
             raise ValueError("it does not start like one")
-    return can.MF4Reader(log.path)
+    return can.MF4Reader(path)
 
 
 class _Sqlite(can.io.generic.MessageReader):
     """The rows of python-can's table. Its own reader would run a view of that name, which may have any number of rows of
     any size. Raises sqlite3.Error, ValueError."""
 
-    def __init__(self, log: LogFile) -> None:
+    def __init__(self, log: LogFile, path: Path) -> None:
         self._log = log
-        self._base = sqlite3.connect(f"{log.path.absolute().as_uri()}?mode=ro", uri=True)
+        self._size = path.stat().st_size
+        self._base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
         self._base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_ROW)
         self._base.execute("PRAGMA trusted_schema = OFF")
         kinds = [row[2] for row in self._base.execute("PRAGMA main.table_list('messages')")]
@@ -137,7 +149,7 @@ class _Sqlite(can.io.generic.MessageReader):
             raise ValueError(f"its 'messages' is a {kinds[0]}" if kinds else "it has no table 'messages'")
 
     def __iter__(self) -> Iterator[can.Message]:
-        most_rows = self._log.bytes_total // MIN_ROW  # a damaged tree may lead to the same row again and again
+        most_rows = self._size // MIN_ROW  # a damaged tree may lead to the same row again and again
         for number, row in enumerate(self._base.execute("SELECT * FROM main.messages")):
             if number > most_rows:
                 raise ValueError(f"more than {most_rows} rows")
