@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain, islice
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from fusiond.config.schema import Config
 from fusiond.events import Received
@@ -23,7 +23,11 @@ from fusiond_adapters.can.decoder import PDU2, CanDecoder, frame_key, parameter_
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 
+if TYPE_CHECKING:
+    from fusiond_adapters.logs.survey import Survey
+
 ID_BITS = 0x1FFFFFFF  # in the 8-digit ids of candump
+OBD_ANSWERS = range(0x7E8, 0x7F0)  # ids
 STEP_NS = SECOND  # a stamp that jumps by more is compared with the next one
 DECISION = 100  # wheel frames from which the channels are chosen
 
@@ -61,6 +65,18 @@ class Wanted(NamedTuple):
             yield b"(?:%b)%b" % (heads, rest)
 
 
+class Everything(Wanted):
+    """In place of the wanted ids: all."""
+
+    def holds(self, arbitration_id: int, is_extended: bool) -> bool:
+        return True
+
+    def patterns(self) -> Iterator[bytes]:
+        yield b"[0-9A-F]{3}|[01][0-9A-F]{7}"
+
+
+EVERYTHING = Everything(frozenset(), frozenset())
+
 FrameReader = Callable[[LogFile, Wanted], Iterator[LogFrame]]
 """The frames of a log whose ids are wanted. It counts all frames, and the bad ones by kind."""
 
@@ -76,6 +92,17 @@ def open_can_log(opening: Opening, read: FrameReader) -> Reading:
         raise LogError(f"{name}={file.path}: a {file.suffix} is a CAN log; configured buses: {buses}")
     decoders = {bus: CanDecoder(config, bus, opening.sequences) for bus in (config.can if name is None else (name,))}
     return Reading("can", list(decoders.values()), _events(opening, read, decoders))
+
+
+def survey_can_log(found: Survey, read: FrameReader) -> None:
+    """Add what is in a CAN log to a survey: a stream for each id of each channel."""
+    found.protocol = "can"
+    for t_ns, channel, arbitration_id, is_extended, data in _without_strays(read(found.file, EVERYTHING), found.file):
+        name = f"0x{arbitration_id:08X}" if is_extended else f"0x{arbitration_id:03X}"
+        if arbitration_id in OBD_ANSWERS and not is_extended and len(data) > 2:
+            name += f" {data[1]:02X}{data[2]:02X}"  # each service and PID is a stream of its own
+        found.ids[name] = arbitration_id, is_extended
+        found.add("" if channel is None else channel, name, t_ns).keep(t_ns, data)
 
 
 def _events(opening: Opening, read: FrameReader, decoders: Mapping[str, CanDecoder]) -> Iterator[list[Received]]:

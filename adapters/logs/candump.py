@@ -5,11 +5,15 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from fusiond.units import MICROSECOND, SECOND
-from fusiond_adapters.logs.can_channels import ID_BITS, LogFrame, Wanted, open_can_log
+from fusiond_adapters.logs.can_channels import ID_BITS, LogFrame, Wanted, open_can_log, survey_can_log
 from fusiond_adapters.logs.file import MAX_LINE, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
+
+if TYPE_CHECKING:
+    from fusiond_adapters.logs.survey import Survey
 
 LINE = re.compile(
     rb"\s*\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"  # (seconds.fraction) channel id
@@ -26,6 +30,11 @@ ERROR_FLAG = 0x20000000  # in the 8-digit ids of candump
 def open_log(opening: Opening) -> Reading:
     """The reading of a .log. Raises LogError, ConfigError."""
     return open_can_log(opening, _candump)
+
+
+def survey(found: Survey) -> None:
+    """Add what is in a log to a survey. Raises LogError."""
+    survey_can_log(found, _line_by_line)
 
 
 def _candump(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
@@ -53,6 +62,15 @@ def _candump(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
                 if frame is not None:
                     yield frame
                 at = end
+
+
+def _line_by_line(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:
+    """The same where most ids are wanted."""
+    for text in _whole_lines(log):
+        for line in text.splitlines():
+            frame = _frame(line, wanted, log.counts)
+            if frame is not None:
+                yield frame
 
 
 def _frame(line: bytes, wanted: Wanted, counts: Counter[str]) -> LogFrame | None:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from struct import Struct
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,10 +33,14 @@ from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.sensors import Handler
 
+if TYPE_CHECKING:
+    from fusiond_adapters.logs.survey import Survey
+
 HEAD = b"\xa3\x95"
 HEADER = 3  # bytes: these two, and the type
 FMT, FMT_SIZE = 128, 89
 FMT_BODY = Struct("<BB4s16s64s")  # type, length, name, format, columns
+TOLD = 200  # characters of the autopilot's messages about itself
 PIECE = 1 << 22  # bytes taken at a time
 CODES = {  # of a column: numpy's type, and the factor to its unit
     "a": ("(32,)<i2", 1), "b": ("i1", 1), "B": ("u1", 1), "h": ("<i2", 1), "H": ("<u2", 1), "i": ("<i4", 1), "I": ("<u4", 1),
@@ -77,6 +81,24 @@ def _events(log: LogFile, decoder: AutopilotLog) -> Iterator[list[Received]]:
         yield from decoder.events(samples for maker in makers for samples in maker(records))
     if not log.counts["records"]:
         raise LogError(f"{log.path}: no record in it; is it a DataFlash log?")
+
+
+def survey(found: Survey) -> None:
+    """Add what is in a .bin to a survey: a stream for each kind of record, by instance. Raises LogError."""
+    found.protocol, log = "mavlink", found.file
+    base_ns = boot_unix_ns(log)
+    for records in pieces(log, log.counts):
+        for name, (_, columns) in records.items():
+            numbers = columns.get("I", columns.get("C"))
+            t_ns = base_ns + log_time_us(name, columns) * MICROSECOND
+            if numbers is None or numbers.ndim != 1 or numbers.dtype.kind not in "iu":
+                found.add_all("autopilot", name, t_ns.tolist())
+                continue
+            for number in np.unique(numbers).tolist():
+                found.add_all("autopilot", f"{name}[{number}]", t_ns[numbers == number].tolist())
+        if "MSG" in records:
+            told = b" ".join(records["MSG"].columns["Message"].tolist()).decode("ascii", "replace")
+            found.senders["autopilot"] = (found.senders.get("autopilot", "ARDUPILOTMEGA") + f" {told}")[:TOLD]
 
 
 def pieces(log: LogFile, counts: Counter[str]) -> Iterator[dict[str, Records]]:

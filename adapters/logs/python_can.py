@@ -12,15 +12,19 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import can
 from can.io.blf import BLFParseError
 
 from fusiond.units import MICROSECOND
 from fusiond_adapters.logs.blf import checked
-from fusiond_adapters.logs.can_channels import LogFrame, Wanted, open_can_log
+from fusiond_adapters.logs.can_channels import LogFrame, Wanted, open_can_log, survey_can_log
 from fusiond_adapters.logs.file import MAX_LINE, BlockStream, LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
+
+if TYPE_CHECKING:
+    from fusiond_adapters.logs.survey import Survey
 
 BINARY = (".blf", ".db", ".mf4")  # the others are text
 FILES = (".db", ".mf4")  # read from a file, not from a stream
@@ -37,6 +41,11 @@ DAMAGE: tuple[type[Exception], ...] = (
 def open_log(opening: Opening) -> Reading:
     """The reading of a log, by its suffix. Raises LogError, ConfigError."""
     return open_can_log(opening, _python_can)
+
+
+def survey(found: Survey) -> None:
+    """Add what is in a log to a survey. Raises LogError."""
+    survey_can_log(found, _python_can)
 
 
 def _python_can(log: LogFile, wanted: Wanted) -> Iterator[LogFrame]:

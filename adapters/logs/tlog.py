@@ -13,7 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from struct import Struct
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
+
+import pymavlink.dialects.v20.ardupilotmega as dialect
 
 from fusiond.events import Received
 from fusiond.units import MICROSECOND
@@ -22,6 +24,7 @@ from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.decoder import (
     CHECKSUM,
     HEADER_2,
+    HEARTBEAT,
     LENGTH_KNOWN,
     MAGIC,
     MAGIC_1,
@@ -32,8 +35,12 @@ from fusiond_adapters.mavlink.decoder import (
     Dialect,
     MavlinkDecoder,
     frame_length,
+    message_id,
 )
 from fusiond_adapters.mavlink.tlog_record import STAMP, STAMP_SIZE
+
+if TYPE_CHECKING:
+    from fusiond_adapters.logs.survey import Survey
 
 RECORD_2 = Struct(">Q10B")  # stamp, and the header of a MAVLink 2 frame
 OVERHEAD = STAMP_SIZE + HEADER_2 + CHECKSUM  # bytes of a MAVLink 2 record without its payload
@@ -76,6 +83,46 @@ def read_tlog(log: LogFile, decoder: FrameDecoder) -> Iterator[list[Received]]:
     yield from _Records(log, decoder)
     if not log.counts["records"]:
         raise LogError(f"{log.path}: no MAVLink frame in it; is it a .tlog?")
+
+
+def survey(found: Survey) -> None:
+    """Add what is in a .tlog to a survey: a stream for each message of each component. Raises LogError."""
+    found.protocol = "mavlink"
+    for _ in read_tlog(found.file, _Surveyor(found)):
+        pass
+
+
+class _Surveyor:
+    """In place of a decoder: adds frames to a survey."""
+
+    def __init__(self, found: Survey) -> None:
+        self.dialect = Dialect("ardupilotmega")
+        self._found = found
+        self._names = {number: name for name, number in self.dialect.ids.items()}
+
+    def decode(self, frame: bytes, t_receive_ns: int) -> list[Received]:
+        at = 5 if frame[0] == MAGIC_2 else 3
+        return self.decode_by_header(message_id(frame), 0, frame[at], frame[at + 1], frame, t_receive_ns)
+
+    def decode_by_header(
+        self, number: int, _counter: int, system: int, component: int, frame: bytes, t_receive_ns: int
+    ) -> list[Received]:
+        if self.dialect.sound(frame) is False:
+            self._found.file.counts["bad checksum"] += 1
+            return []
+        sender, name = f"system {system}, component {component}", self._names.get(number, f"message {number}")
+        self._found.add(sender, name, t_receive_ns)
+        if name == HEARTBEAT and sender not in self._found.senders:
+            self._found.senders[sender] = _described(frame)
+        return []
+
+
+def _described(heartbeat: bytes) -> str:
+    """The kinds of autopilot and of vehicle in a HEARTBEAT."""
+    message = dialect.MAVLink(None).decode(bytearray(heartbeat))
+    kinds = (("MAV_AUTOPILOT", message.autopilot), ("MAV_TYPE", message.type))
+    names = [dialect.enums[enum][value].name if value in dialect.enums[enum] else f"{enum}_{value}" for enum, value in kinds]
+    return ", ".join(name.removeprefix("MAV_AUTOPILOT_").removeprefix("MAV_TYPE_") for name in names)
 
 
 class _Records:

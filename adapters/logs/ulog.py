@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from fusiond_adapters.logs.autopilot_log import (
 from fusiond_adapters.logs.file import LogError, LogFile
 from fusiond_adapters.logs.format import Opening, Reading
 from fusiond_adapters.mavlink.sensors import Handler
+
+if TYPE_CHECKING:
+    from fusiond_adapters.logs.survey import Survey
 
 IMU, AIR, BAROMETER, ENCODERS = "sensor_combined", "vehicle_air_data", "sensor_baro", "wheel_encoders"
 RECEIVERS = ("sensor_gps", "vehicle_gps_position")  # the first that the log has
@@ -55,8 +58,19 @@ def _events(log: LogFile, decoder: AutopilotLog) -> Iterator[list[Received]]:
     yield from decoder.events(one for one in samples if one is not None)
 
 
+def survey(found: Survey) -> None:
+    """Add what is in a .ulg to a survey: a stream for each topic, by instance. Raises LogError."""
+    found.protocol = "mavlink"
+    topics = read_topics(found.file, ())
+    base_ns = boot_unix_ns(topics)
+    for (name, number), columns in topics.items():
+        t_ns = base_ns + columns["timestamp"].astype(np.int64) * MICROSECOND
+        found.add_all("autopilot", f"{name}[{number}]", t_ns.tolist())
+    found.senders["autopilot"] = "PX4"
+
+
 def read_topics(log: LogFile, names: tuple[str, ...]) -> Topics:
-    """The topics of a log by name and instance. Raises LogError if it is none, or pyulog is missing."""
+    """Topics of a log, or all, by name and instance. Raises LogError if it is none, or pyulog is missing."""
     if importlib.util.find_spec("pyulog") is None:
         raise LogError(f"{log.path}: reading .ulg needs the extra ulog: pip install 'fusiond[ulog]'")
     from pyulog import ULog  # noqa: PLC0415 - an extra, imported only where such a file is read
@@ -64,7 +78,7 @@ def read_topics(log: LogFile, names: tuple[str, ...]) -> Topics:
 
     with log.unzipped() as path, path.open("rb") as file:
         try:
-            found: Any = ULog(file, list(names))
+            found: Any = ULog(file, list(names) or None)
         except (*DAMAGE, ULogException) as error:
             raise LogError(f"{log.path}: is not a ULog: {error}") from error
     if found.dropouts:

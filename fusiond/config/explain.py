@@ -99,7 +99,8 @@ def oddities(config: Config) -> Iterator[str]:
         if delay_ms < 0:
             yield f"{where}: with a delay of {delay_ms:g} ms it would measure the future"
     for name, imu in config.imu.items():
-        if config.autopilot.kind == "ardupilot" and config.autopilot.link == imu.link and not (
+        linked = imu.link is not None and config.autopilot.link == imu.link
+        if config.autopilot.kind == "ardupilot" and linked and not (
             imu.delay_ms or imu.delay_sigma_ms
         ):
             yield (

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from fusiond.app.presets import FOLDER
 from fusiond.config import load as config
 from fusiond.config.plausible import RANGES, implausible
 from fusiond.config.schema import Filter, sensor_tables
@@ -44,7 +45,7 @@ def test_usual_values() -> None:
 
 
 @pytest.mark.parametrize(
-    "path", [*sorted((ROOT / "configs").glob("*r*.toml")), *sorted((ROOT / "configs/cars").glob("*.toml"))]
+    "path", [*sorted((ROOT / "configs").glob("*r*.toml")), *sorted(FOLDER.glob("*.toml"))]
 )
 def test_the_configurations_that_are_given_are_plausible(path: Path) -> None:
     assert list(implausible(config.load(path))) == []

@@ -1,4 +1,4 @@
-"""The presets of configs/cars: each can be used, and reads a frame of its car as the speeds that it holds."""
+"""The presets of fusiond/app/presets: each can be used, and reads a frame of its car as the speeds that it holds."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import can
 import pytest
 
 from fusiond import __main__ as command
+from fusiond.app.presets import FOLDER
 from fusiond.config import load as config
 from fusiond.events import Invalid, WheelSpeed
 from fusiond_adapters.can.decoder import CanDecoder
 from fusiond_adapters.logs.merge import open_logs
-from tests.helpers.paths import ROOT
 
-CARS = ROOT / "configs" / "cars"
+CARS = FOLDER
 WHEELS = ["front_left", "front_right", "rear_left", "rear_right"]
 
 FRAMES = {  # id, data, speeds of the wheels [km/h]; of ford [rad/s]
@@ -25,6 +25,7 @@ FRAMES = {  # id, data, speeds of the wheels [km/h]; of ford [rad/s]
     "tesla": (0x175, "84A370188EC30100", [36.00, 36.04, 36.08, 36.12]),
     "ford": (0x217, "0BB80BBC0BC00BC4", [30.00, 30.04, 30.08, 30.12]),
     "j1939_ebc2": (0x18FEBF0B, "00247D7E7F80FFFF", [36.0, 36.0625, 36.125, 36.1875]),
+    "obd": (0x7E8, "03410D2400000000", [36.0]),
     "j1939_hrw": (0x08FE6E0B, "0024102420243024", [36.0, 36.0625, 36.125, 36.1875]),
 }
 
@@ -41,7 +42,7 @@ def test_every_preset_has_a_frame_here() -> None:
 def test_frame_to_speeds(car: str) -> None:
     arbitration_id, data, speeds = FRAMES[car]
     events = decoder(car).decode(arbitration_id, arbitration_id > 0x7FF, bytes.fromhex(data), 0)
-    assert [event.source for event in events] == WHEELS
+    assert [event.source for event in events] == (["speed"] if car == "obd" else WHEELS)
     metres = 0.33 if car == "ford" else 1 / 3.6
     payloads = [event.payload for event in events]
     assert all(isinstance(payload, WheelSpeed) for payload in payloads), payloads
@@ -58,7 +59,7 @@ def test_check_accepts_it_without_a_warning(car: str, capsys: pytest.CaptureFixt
 def test_all_bits_set_is_no_speed(car: str) -> None:
     arbitration_id = FRAMES[car][0]
     events = decoder(car).decode(arbitration_id, arbitration_id > 0x7FF, b"\xff" * 8, 0)
-    assert len(events) == 4 and all(isinstance(event.payload, Invalid) for event in events)
+    assert len(events) == (0 if car == "obd" else 4) and all(isinstance(event.payload, Invalid) for event in events)
 
 
 @pytest.mark.parametrize("car", ["honda", "hyundai"])
