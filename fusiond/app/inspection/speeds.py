@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from fusiond.app.inspection.facts import WheelFacts
 from fusiond.app.presets import names, preset
 from fusiond.config import load as config
+from fusiond.config.schema import Config
 from fusiond.events import WheelSpeed
 from fusiond.maths.typed import Array
 from fusiond.units import SECOND
@@ -38,7 +40,7 @@ def by_presets(survey: Survey, gnss: Array) -> list[WheelFacts]:
     """The presets that a CAN log fits, the best first."""
     found = []
     for name in names():
-        settings = config.load(preset(name))
+        settings = _only_wheels(config.load(preset(name)))
         ((bus, _),) = settings.can.items()
         decoder = CanDecoder(settings, bus)
         for channel in sorted({stream.sender for stream in survey.streams.values()}):
@@ -55,6 +57,13 @@ def by_presets(survey: Survey, gnss: Array) -> list[WheelFacts]:
                     WheelFacts(channel=channel, name=ids, what=what, preset=name, correlation=correlation, factor=factor)
                 )
     return sorted(found, key=lambda one: (-one.what.count(","), -(one.correlation or 0.0)))
+
+
+def _only_wheels(settings: Config) -> Config:
+    """A configuration without what else comes by its bus."""
+    ((bus, _),) = settings.can.items()
+    others = {one.table for one in settings.sensors(bus=bus)} - {"wheel"}
+    return replace(settings, **dict.fromkeys(others, {}))
 
 
 def _is_wanted(decoder: CanDecoder, number: int, is_extended: bool) -> bool:
