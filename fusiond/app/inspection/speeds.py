@@ -63,7 +63,7 @@ def _only_wheels(settings: Config) -> Config:
     """A configuration without what else comes by its bus."""
     ((bus, _),) = settings.can.items()
     others = {one.table for one in settings.sensors(bus=bus)} - {"wheel"}
-    return replace(settings, **dict.fromkeys(others, {}))
+    return replace(settings, **{table: {} for table in others})
 
 
 def _is_wanted(decoder: CanDecoder, number: int, is_extended: bool) -> bool:
