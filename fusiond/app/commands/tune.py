@@ -14,8 +14,9 @@ from fusiond.app.tuning.tune import text, tune
 
 ABOUT = """\
 Tell what the logs of one drive say of their own noise, delays and installation: each value with its uncertainty, and
-whether the log can tell it at all. The first half of the log tells. Groups of values that make spells without GNSS worse
-there are not taken; how the others do in the second half is told. Writes the new configuration, and shows the difference."""
+whether the log can tell it at all. The first half of the log tells. Groups of values without which its spells without
+GNSS are bridged better are not taken; how the others do in the second half is told. Writes the new configuration, and
+shows the difference."""
 EXAMPLES = """\
 examples:
   fusiond tune car.toml drive.tlog drive.log -o tuned.toml

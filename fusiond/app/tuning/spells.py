@@ -29,7 +29,16 @@ class Score(Struct, frozen=True, kw_only=True):
     length_s: float
     rmse_m: float  # horizontal
     nees: float  # mean squared error by the covariance of state and fix: 2 if that is honest
-    score: float  # mean log-likelihood of the errors, larger is better
+    each: list[float]  # log-likelihood of each error, larger is better
+
+
+def is_better(one: Score, other: Score) -> bool:
+    """Whether the errors of one are likelier than those of the other, spell by spell, by more than chance: one standard
+    error of the mean difference."""
+    if len(one.each) != len(other.each):
+        return len(one.each) > len(other.each)  # the other had no state at some ends
+    gained = np.subtract(one.each, other.each)
+    return bool(gained.mean() > gained.std() / math.sqrt(len(gained)))
 
 
 class _End(NamedTuple):
@@ -55,7 +64,7 @@ def score(config: Config, log: LogSeries, begin_s: float, end_s: float, length_s
         length_s=length_s,
         rmse_m=math.sqrt(float(np.mean([float(end.off @ end.off) for end in ends]))),
         nees=float(nees.mean()),
-        score=-float((np.minimum(nees, MOST_NEES) + sizes).mean()) / 2,
+        each=(-(np.minimum(nees, MOST_NEES) + sizes) / 2).tolist(),
     )
 
 

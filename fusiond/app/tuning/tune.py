@@ -17,7 +17,7 @@ from fusiond.app.tuning import methods
 from fusiond.app.tuning.edit import with_keys
 from fusiond.app.tuning.methods import Estimate, SlowNoise
 from fusiond.app.tuning.series import LogSeries, read_series, until
-from fusiond.app.tuning.spells import Score, length_for, score
+from fusiond.app.tuning.spells import Score, is_better, length_for, score
 from fusiond.config import load
 from fusiond.config.schema import Config, Gnss
 from fusiond.config.toml import read_text
@@ -135,17 +135,22 @@ def _rounded(value: float) -> float:
 def _decided(
     path: Path, text: str, config: Config, findings: Sequence[Finding], log: LogSeries, half: float
 ) -> tuple[list[Finding], list[str]]:
-    """The findings to take: group by group those that do not make the spells of the first half worse."""
-    told = [one for one in findings if not one.untold and abs(one.found - one.configured) > DIFFERENT * one.sigma]
-    length, kept, dropped = length_for(half), list[Finding](), list[str]()
-    best = score(config, log, 0.0, half, length)
-    for group in dict.fromkeys(one.group for one in told):
-        candidate = [*kept, *(one for one in told if one.group == group)]
-        now = score(_config(path, text, config, candidate), log, 0.0, half, length)
-        if best is not None and (now is None or now.score < best.score):
+    """The findings to take: all, but for the groups without which the spells of the first half are bridged better; and none
+    where they are bridged better as configured."""
+    kept = [one for one in findings if not one.untold and abs(one.found - one.configured) > DIFFERENT * one.sigma]
+    length, dropped = length_for(half), list[str]()
+    configured = score(config, log, 0.0, half, length)
+    best = score(_config(path, text, config, kept), log, 0.0, half, length)
+    if configured is None or best is None:
+        return kept, dropped
+    for group in dict.fromkeys(one.group for one in kept):
+        others = [one for one in kept if one.group != group]
+        without = score(_config(path, text, config, others), log, 0.0, half, length)
+        if without is not None and is_better(without, best):
+            kept, best = others, without
             dropped.append(group)
-            continue
-        kept, best = candidate, now
+    if kept and is_better(configured, best):
+        return [], [*dropped, *dict.fromkeys(one.group for one in kept)]
     return kept, dropped
 
 
@@ -403,7 +408,7 @@ def _lines(report: TuneReport) -> Iterator[str]:
     for line, one in zip(aligned[1:], report.findings, strict=True):
         yield line + ("   taken" if one.taken else f"   not told: {one.untold}" if one.untold else _why_not(one))
     for group in report.dropped:
-        yield f"{group}: told, but spells without GNSS in the first half got worse with it: not taken"
+        yield f"{group}: told, but spells without GNSS in the first half are bridged better without it: not taken"
     yield ""
     yield from _scores(report)
     yield ""

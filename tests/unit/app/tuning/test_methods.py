@@ -16,6 +16,7 @@ from fusiond.app.tuning.methods import (
     structure,
     white_sigma,
 )
+from fusiond.app.tuning.spells import Score, is_better
 from fusiond.maths.typed import Array
 
 STEP = 0.2
@@ -107,3 +108,16 @@ def test_a_delay_is_told_with_its_uncertainty() -> None:
     assert found.value == pytest.approx(0.12, abs=3 * found.sigma) and found.sigma < 0.01
     still = lag_of(t, reading[:, None], speed[:, None], np.zeros((len(t), 1)), 1.0)
     assert still.untold == "the speed never changed"
+
+
+def test_better_is_more_than_chance() -> None:
+    random = np.random.default_rng(3)
+    same = random.normal(size=20)
+
+    def found(each: Array) -> Score:
+        return Score(spells=len(each), length_s=10.0, rmse_m=1.0, nees=2.0, each=each.tolist())
+
+    assert is_better(found(same + 1.0 + 0.1 * random.normal(size=20)), found(same))
+    assert not is_better(found(same), found(same))
+    assert not is_better(found(same + np.where(np.arange(20) % 2, 5.0, -4.9)), found(same))
+    assert is_better(found(same), found(same[:5]))
