@@ -186,6 +186,7 @@ class Replay:
     def sources(self) -> dict[str, SourceReport]:
         """What came of each source, and its outcomes."""
         outcomes, fusion = self.fusion.outcomes(), self.fusion
+        health = fusion.health(self.engine.now_ns)
         return {
             name: source_report(
                 self._withheld[name],
@@ -194,6 +195,7 @@ class Replay:
                 self._latencies[name].report(),
                 self._lateness.get(name),
                 self._remark(name, outcomes[name]),
+                health[name],
             )
             for name in self.config.sources()
         }

@@ -15,6 +15,7 @@ from fusiond.app.replay.comparison import AngleReport, Errors, TruthReport
 from fusiond.app.replay.outages import OutageReport
 from fusiond.app.replay.statistics import Histogram
 from fusiond.estimator.solution import Mode
+from fusiond.filter.source_health import Belief
 from fusiond.messages.types import StateMessage
 from fusiond.timeline.aligner import PLAUSIBLE_LATENCY, ClockReport
 from fusiond.units import MILLISECOND, SECOND
@@ -60,6 +61,8 @@ class SourceReport(Struct, frozen=True, kw_only=True):
     latency_ms: Latency | None  # None if no event was usable
     lateness: TooOld | None = None  # of those that were too old
     remark: str = ""  # what is wrong with a wheel most of whose readings were rejected
+    status: str = "nominal"  # what the filter believes of its health at the end: nominal, noisy, biased, frozen, absent
+    reason: str = ""  # why, where it is not nominal
 
 
 class Span(Struct, frozen=True, kw_only=True):
@@ -242,8 +245,9 @@ def source_report(
     latency: Latency | None,
     lateness: TooOld | None = None,
     remark: str = "",
+    belief: Belief | None = None,
 ) -> SourceReport:
-    """`outcomes`: counts by Outcome's names."""
+    """`outcomes`: counts by Outcome's names; `belief`: in its health at the end."""
     counts = {name.lower(): count for name, count in outcomes.items()}
     return SourceReport(
         events=sum(counts.values()) + withheld,
@@ -252,6 +256,8 @@ def source_report(
         latency_ms=latency,
         lateness=lateness,
         remark=remark,
+        status=belief.status if belief else "nominal",
+        reason=belief.reason if belief else "",
         **counts,
     )
 
@@ -336,6 +342,8 @@ def _remarks(summary: Summary) -> Iterator[str]:
             yield f"  invalid of {name}: {reasons}"
         if source.remark:
             yield f"  {name} is of no use: {source.remark}"
+        elif source.status != "nominal":
+            yield f"  {name} is {source.status} at the end: {source.reason}"
         if source.too_old:
             why = _why(source.lateness, summary.clocks)
             yield f"  {name}: {source.too_old} came later than filter.horizon_s allows{why}"
