@@ -17,7 +17,7 @@ COMMANDS = {
     "report": "fuse recorded logs, and write one HTML file that shows the drive and what became of its data",
     "batch": "replay many drives, and tell whether a configuration is better on them",
     "doctor": "find what the data of recorded logs say against a configuration",
-    "compare": "compare two tracks of one drive: of two configurations, or of two versions",
+    "compare": "compare two tracks of one drive: of two configurations, two versions, or with the autopilot's own",
     "tune": "tell what logs say of their noise, delays and installation, and write a better configuration",
     "top": "show a running vehicle's state, sources, latencies and health in the terminal",
     "fleet": "show many running vehicles at once, and their alarms",

@@ -1,8 +1,9 @@
-"""A track as arrays: of a CSV file, or of a replay with a configuration."""
+"""A track as arrays: of a CSV file, of a replay with a configuration, or the autopilot's own in a log."""
 
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,11 @@ from fusiond.messages.csv import CSV_COLUMNS
 from fusiond.messages.types import StateMessage
 from fusiond.units import MICROSECOND
 from fusiond_adapters.logs.merge import open_logs
+from fusiond_adapters.logs.own_estimate import own_estimate
 
 NUMBERS = CSV_COLUMNS[1:-1]
 COUNT = len(NUMBERS)
+SIGMAS = 5  # columns of sigmas, at the end
 
 
 class SeriesError(UnusableError):
@@ -88,3 +91,14 @@ def of_replay(name: str, config: Config, logs: Sequence[str], rate_hz: float | N
 
     Replay(config, ReplayTask(rate_hz or config.publish.rate_hz, on_tick=[add])).run(open_logs(logs, config))
     return Series.of(name, t_ns, numbers, modes)
+
+
+def of_autopilot(path: str) -> Series:
+    """What the autopilot held for true, in its log. It has no sigmas. Raises LogError, SeriesError."""
+    t_ns, numbers = list[int](), list[tuple[float, ...]]()
+    for state in own_estimate(path):
+        t_ns.append(state.t_ns)
+        place = math.degrees(state.latitude), math.degrees(state.longitude), state.height
+        unknown = (math.nan,) * SIGMAS
+        numbers.append((*place, *state.velocity_n, math.nan, math.nan, math.degrees(state.yaw), *unknown))
+    return Series.of(f"the autopilot's own in {path}", t_ns, numbers, [""] * len(t_ns))

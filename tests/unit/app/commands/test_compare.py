@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fusiond.__main__ import main
+from fusiond.app.compare import series as series_module
 from fusiond.app.compare.differences import differences, text
-from fusiond.app.compare.series import NUMBERS, Series, SeriesError
+from fusiond.app.compare.series import NUMBERS, Series, SeriesError, of_autopilot, of_replay
+from fusiond.config.load import load
 from fusiond.messages.csv import csv_header
 from fusiond.units import SECOND
+from fusiond_adapters.logs.own_estimate import OwnState
 from tests.conftest import needs_compiled
 from tests.helpers.drive import LOGS, folder
+from tests.helpers.paths import CAPTURED
 
 T0 = 1_700_000_000 * SECOND
+COPTER = CAPTURED / "flight-logs" / "copter-log171.bin"
 STATE = {"lat_deg": 48.0, "lon_deg": 179.9999, "height_m": 500.0, "vn_mps": 10.0, "yaw_deg": 179.9}
 SIGMAS = {"sigma_n_m": 0.3, "sigma_e_m": 0.4, "sigma_d_m": 1.0, "sigma_v_mps": 0.1, "sigma_yaw_deg": 0.5}
 
@@ -110,13 +116,39 @@ def test_a_configuration_and_its_own_track(tmp_path: Path, capsys: pytest.Captur
     assert "nowhere further apart" in out and "  horizontal position  0.000       0.000  0.000     m" in out
 
 
+@needs_compiled
+def test_the_autopilots_own(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is 3 m higher than fusiond, and has no sigmas. Its log is read by its first name, without that of a link."""
+    read: list[str] = []
+
+    def own(path: str) -> list[OwnState]:
+        read.append(path)
+        track = of_replay("fusiond", load(folder() / "fusiond.toml"), logs())
+        lat, lon, height = (track.column(c).tolist() for c in ("lat_deg", "lon_deg", "height_m"))
+        rows = zip(track.t_ns.tolist(), map(math.radians, lat), map(math.radians, lon), height, strict=True)
+        return [OwnState(t, phi, lam, h + 3.0, (0.0, 0.0, 0.0), math.nan) for t, phi, lam, h in rows]
+
+    monkeypatch.setattr(series_module, "own_estimate", own)
+    assert main(["compare", str(folder() / "fusiond.toml"), *logs()]) == 0
+    out = capsys.readouterr().out
+    assert read == logs()[:1] and "the autopilot's own" in out and "heading" not in out
+    (height,) = [line.split() for line in out.splitlines() if line.startswith("  height")]
+    assert height[1:4] == ["3.000"] * 3 and height[6:] == ["-"] * 4
+
+
+@pytest.mark.skipif(not COPTER.is_file(), reason="the captured flight is not beside the project")
+def test_the_autopilots_own_in_a_captured_log() -> None:
+    found = of_autopilot(str(COPTER))
+    assert len(found.t_ns) > 1000 and np.isfinite(found.column("lat_deg")).all() and np.ptp(found.column("lat_deg")) < 0.1
+
+
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ([], "give two configurations or tracks"),
-        (["a.csv", "b.csv", "c.csv"], "give two configurations or tracks (.toml, .csv), not 3"),
+        ([], "give one or two configurations or tracks"),
+        (["a.csv", "b.csv", "c.csv"], "give one or two configurations or tracks (.toml, .csv), not 3"),
         (["a.toml", "b.csv"], "give the logs of the drive as well"),
-        (["a.csv"], "give two configurations or tracks (.toml, .csv), not 1"),
+        (["a.csv"], "give the logs of the drive as well"),
     ],
 )
 def test_what_cannot_be_compared(files: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
