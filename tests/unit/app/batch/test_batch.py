@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import duckdb
+import fsspec
 import pandas as pd
 import polars as pl
 import pytest
@@ -24,6 +25,7 @@ from fusiond.app.batch.engines import Cluster, Engine, LocalPool, Numbered
 from fusiond.app.batch.job import Answer, Limits, Options
 from fusiond.app.batch.row import Row
 from fusiond.app.batch.table import read_rows
+from fusiond.config import load, recorded
 from tests.helpers import fleet
 
 LIMITS = Limits(seconds=1.0, memory_mb=300.0)
@@ -181,6 +183,31 @@ def test_tracks_and_outages(tmp_path: Path) -> None:
     assert blind.distance_m == pytest.approx(row.distance_m, rel=0.02)
     assert blind.outages[0].error_m == pytest.approx(outage.error_m, abs=1.5)
     assert row.outage_68_percent is not None and 0 < row.outage_68_percent < 5
+
+
+@pytest.mark.parametrize("where", ["folder", "store"])
+def test_recordings_of_a_black_box_are_taken_as_they_lie(where: str, tmp_path: Path) -> None:
+    """With the configuration that each was recorded with, whose DBC files lie beside it under other names."""
+    made = fleet.drives(tmp_path / "drives", range(2))
+    box = tmp_path / "box"
+    box.mkdir()
+    for number, drive in enumerate(made, 1):
+        for second, name in enumerate(("fcu.tlog", "can.log")):
+            source = drive / ("drive.tlog" if name == "fcu.tlog" else "drive.log")
+            (box / f"{number:04d}-20260301T08000{second}.000000Z-{name}").write_bytes(source.read_bytes())
+        for name, content in recorded.files(load.load(drive / "fusiond.toml")):
+            (box / f"{number:04d}-20260301T080000.000000Z-{name}").write_bytes(content)
+    given = str(box)
+    if where == "store":
+        store = fsspec.filesystem("local")  # by an URL, so that each drive's process fetches its files
+        given = store.unstrip_protocol(given)
+    done(Order([given], tmp_path / "out", options=OPTIONS), LocalPool(1))
+    found = list(read_rows(tmp_path / "out" / ROWS))
+    assert [(name.rpartition("/")[2], row.status, row.reason) for name, _, row in found] == [
+        ("0001", "ok", ""), ("0002", "ok", ""),
+    ]  # fmt: skip
+    assert all(row.config == "config.json" and row.states > 50 for _, _, row in found)
+    assert "front_left" in {source.name for source in found[0][2].sources if source.fused}
 
 
 def test_without_a_truth_the_smoother_is_the_reference(tmp_path: Path) -> None:
