@@ -12,8 +12,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import msgspec
+
 from fusiond.app.batch.job import Drive, DriveFile, Job
-from fusiond.app.batch.row import CalibrationRow, Row, SourceRow
+from fusiond.app.batch.row import CalibrationRow, FindingRow, Row, SourceRow
+from fusiond.app.diagnosis.diagnose import diagnose, missing
 from fusiond.app.replay.comparison import Errors
 from fusiond.app.replay.files import short_names, stored_state, truth_of, with_short_names
 from fusiond.app.replay.job import Options as ReplayOptions
@@ -164,16 +167,22 @@ class _Measurement:
                 task.on_tick.append(track.add)
             run, logs = self._run(task)
             if run.first_ns is None:
-                found = "; ".join(f"{Path(path).name}: {counts}" for path, counts in logs.counts.items())
-                raise NoTrack(f"nothing in the logs that the configuration asks for ({found})")
+                why = "; ".join(one.text for one in missing(self._config, run.sources(), logs))
+                raise NoTrack(f"nothing in the logs that the configuration asks for: {why}")
             names = short_names(logs.counts)
             counts = {names[path]: count for path, count in logs.counts.items()}
             warnings = [with_short_names(warning, names) for warning in logs.warnings]
             summary = run.summary(str(self._known["config"]), counts, warnings)
+            has_state = summary.final.state is not None
+            findings = diagnose(run.evidence, run.fusion, run.sources(), logs, has_state=has_state)
             if not first.states:
-                raise NoTrack(f"no state: {summary.final.fault or 'the filter never had enough data to start'}")
+                reasons = "; ".join(one.text for one in findings if one.weight == "no_state")
+                why = summary.final.fault or reasons or "the filter never had enough data to start"
+                raise NoTrack(f"no state: {why}")
         outages = self._outages(run, first) if self._job.options.outage else None
-        return self._told(summary, run, first, outages, Path(self._job.track).name)
+        row = self._told(summary, run, first, outages, Path(self._job.track).name)
+        found = [FindingRow(kind=one.kind, weight=one.weight, text=one.text, key=one.key) for one in findings]
+        return msgspec.structs.replace(row, findings=found)
 
     def _smooth(self, config: Config) -> list[TruthSample]:
         """The smoothed track by a configuration; empty where the logs give none."""

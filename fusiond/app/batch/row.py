@@ -28,6 +28,15 @@ class SourceRow(Struct, frozen=True, kw_only=True):
     remark: str  # what is wrong with it, if that is known
 
 
+class FindingRow(Struct, frozen=True, kw_only=True):
+    """What the data say against the configuration, as `fusiond doctor` does."""
+
+    kind: str
+    weight: str  # no_state, contradiction or note
+    text: str
+    key: str  # of the configuration to change; empty: none would help
+
+
 class CalibrationRow(Struct, frozen=True, kw_only=True):
     """What was learnt of the installation: a correction to the configured value, in the unit that its name ends in."""
 
@@ -75,4 +84,5 @@ class Row(Struct, frozen=True, kw_only=True):
     latency_p99_ms: float | None = None  # of the latest source
     sources: list[SourceRow] = []
     calibration: list[CalibrationRow] = []
+    findings: list[FindingRow] = []
     track: str = ""  # name of the file of the track, if one was asked for
