@@ -46,7 +46,7 @@ class Panel:
     fits: list[tuple[str, str]] = field(default_factory=list)  # source and column of each curve that the y axis follows
     note: str = ""
     wide: bool = False
-    floor: float | None = None  # a value that the axis always shows
+    always: tuple[float, ...] = ()  # values that the axis always shows
     fixed: bool = False  # the y axis does not follow the curves
 
 
@@ -107,14 +107,17 @@ class Board:
         self._key(panel, Key(name, label, colour, "marks" if style else "dots"), source, column)
         return drawn
 
-    def band(self, panel: Panel, source: str, low: str, high: str, label: str, colour: str) -> None:
-        """The area between two curves over `t`."""
+    def band(
+        self, panel: Panel, source: str, low: str, high: str, label: str, colour: str, *, fitted: bool = True
+    ) -> None:
+        """The area between two curves over `t`; with `fitted` the y axis follows them."""
         name = f"{panel.name}.{low}"
         panel.plot.varea(
             "t", low, high, source=self._sources[source], fill_color=colour, fill_alpha=0.17, name=name, level="underlay"
         )
-        self._key(panel, Key(name, label, colour, "band"), source, low)
-        panel.fits.append((source, high))
+        panel.keys.append(Key(name, label, colour, "band"))
+        if fitted:
+            panel.fits += [(source, low), (source, high)]
 
     def hover(self, panel: Panel, drawn: Any, columns: Sequence[tuple[str, str, str]]) -> None:
         """Show the values at the pointer: label, column and format of each, with its unit."""
@@ -131,9 +134,8 @@ class Board:
         columns = [self._sources[source].data[column] for source, column in panel.fits]
         known = [values[np.isfinite(values)] for values in columns]
         known = [values for values in known if len(values)]
-        floor = [] if panel.floor is None else [panel.floor]
-        low = min([*(float(np.quantile(values, 1 - USUAL)) for values in known), *floor], default=0.0)
-        high = max([*(float(np.quantile(values, USUAL)) for values in known), *floor], default=1.0)
+        low = min([*(float(np.quantile(values, 1 - USUAL)) for values in known), *panel.always], default=0.0)
+        high = max([*(float(np.quantile(values, USUAL)) for values in known), *panel.always], default=1.0)
         panel.plot.y_range = Range1d(*stretched(low, high), name=f"{panel.name}.y")
 
     def _key(self, panel: Panel, key: Key, source: str, column: str) -> None:

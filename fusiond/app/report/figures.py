@@ -104,7 +104,7 @@ def _errors(board: Board, offset: float) -> Section:
         ("north", "North error", "m"), ("east", "East error", "m"), ("height", "Height error", "m"),
         ("velocity", "Horizontal velocity error", "m/s"), ("heading", "Heading error", "deg"),
     ):  # fmt: skip
-        panel = board.panel(f"{name}_error", title, unit, floor=0.0, wide=name in ("north", "east"))
+        panel = board.panel(f"{name}_error", title, unit, always=(0.0,), wide=name in ("north", "east"))
         board.band(panel, "state", f"{name}_low", f"{name}_high", "± 2 sigma" if name != "velocity" else "2 sigma", BLUE)
         drawn = board.line(panel, "state", f"{name}_error", "error", BLUE)
         label = ("error", f"{name}_error", f"0.000 {unit}")
@@ -129,7 +129,7 @@ def _sigmas(board: Board, data: dict[str, Array]) -> Section:
         values = np.concatenate([data[column] for column, _ in columns])
         values = values[np.isfinite(values) & (values > 0)]
         steep = len(values) > 0 and float(values.max()) > LOG_FROM * float(values.min())
-        how: dict[str, Any] = {"y_axis_type": "log"} if steep else {"floor": 0.0}
+        how: dict[str, Any] = {"y_axis_type": "log"} if steep else {"always": (0.0,)}
         panel = board.panel(name, title, unit, wide=name == "position_sigma", fixed=steep, **how)
         lines = [
             board.line(panel, "state", column, label, colour)
@@ -238,10 +238,12 @@ def _innovations(board: Board, gathered: Gathered) -> Section:
         data = gathered.innovations[name].curves()
         for column in INNOVATION[: 2 * AXES]:
             data[column] = data[column] * factor
-        source = board.source(f"innovation {name}", _gated(data, gathered.axes[name]))
-        panel = board.panel(f"innovation_{number}", f"{name}, {what}".rstrip(", "), unit, floor=0.0)
+        gated = _gated(data, gathered.axes[name])
+        usual = float(np.median(gated["high"]))  # a gate that opens wide at times must not flatten the rest
+        source = board.source(f"innovation {name}", gated)
+        panel = board.panel(f"innovation_{number}", f"{name}, {what}".rstrip(", "), unit, always=(-usual, usual))
         columns = list(zip(INNOVATION[: gathered.axes[name]], axes, AXIS_COLOURS, strict=False))
-        board.band(panel, source, "low", "high", "gate", GREY)
+        board.band(panel, source, "low", "high", "gate", GREY, fitted=False)
         lines = [board.line(panel, source, column, label, shade, line_width=1.0) for column, label, shade in columns]
         if name in gathered.rejected:
             rejected = gathered.rejected[name].curves()
@@ -296,7 +298,7 @@ def _latencies(board: Board, gathered: Gathered) -> Section:
         known = np.flatnonzero(np.isfinite(data["offset"]))
         data["change"] = data["offset"] - (data["offset"][known[0]] if len(known) else 0.0)
         source = board.source(f"clock {name}", data)
-        panel = board.panel(f"clock_{number}", f"Clock {name}", "ms", floor=0.0)
+        panel = board.panel(f"clock_{number}", f"Clock {name}", "ms", always=(0.0,))
         drawn = board.line(panel, source, "change", "offset since the start", BLUE)
         board.line(panel, source, "jitter", "jitter", ORANGE)
         shown = [("offset", "offset", "0.00 ms"), ("jitter", "jitter", "0.00 ms"), ("drift", "drift", "0.0 ppm")]
@@ -319,7 +321,7 @@ def _calibration(board: Board, gathered: Gathered, begun: bool) -> Section:
         middle = np.nan_to_num(value)
         curve = {"t": data["t"], "value": value, "low": middle - two, "high": middle + two}
         source = board.source(f"calibration {name}", curve)
-        panel = board.panel(f"calibration_{name}", _words(name), unit, height=150, floor=0.0)
+        panel = board.panel(f"calibration_{name}", _words(name), unit, height=150, always=(0.0,))
         board.band(panel, source, "low", "high", "± 2 sigma", PURPLE)
         drawn = board.line(panel, source, "value", "learnt", PURPLE)
         board.hover(panel, drawn, [("value", "value", f"0.000 {unit}"), ("from", "low", "0.000"), ("to", "high", "0.000")])

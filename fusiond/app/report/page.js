@@ -49,9 +49,9 @@
     const output = document.getElementById("range");
 
     const fit = (figure) => {
-      const { curves, floor, fixed } = FITS[figure.name];
+      const { curves, always, fixed } = FITS[figure.name];
       if (fixed) return;
-      let low = floor ?? Infinity, high = floor ?? -Infinity;
+      let low = Math.min(...always), high = Math.max(...always);
       for (const [source, column] of curves) {
         const data = model(source).data, values = data[column], t = data.t;
         const stop = lowerBound(t, time.end);

@@ -105,7 +105,7 @@ def _placed(report: Report, board: Board) -> Iterator[Section]:
 
 
 def _fit(panel: Panel) -> dict[str, object]:
-    return {"curves": panel.fits, "floor": panel.floor, "fixed": panel.fixed}
+    return {"curves": panel.fits, "always": panel.always, "fixed": panel.fixed}
 
 
 def _policy(tiles: str | None) -> str:
