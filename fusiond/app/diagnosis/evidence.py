@@ -14,7 +14,7 @@ from fusiond.app.mounting.windows import Gathering
 from fusiond.config.schema import Config
 from fusiond.estimator.fusion import Receipt
 from fusiond.estimator.history import History
-from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample
+from fusiond.events import GnssPosition, GnssVelocity, GnssYaw, ImuSample, WheelSpeed
 from fusiond.filter.rows import Outcome
 from fusiond.maths.typed import Array
 from fusiond.maths.wgs84 import radii
@@ -22,7 +22,7 @@ from fusiond.units import SECOND
 
 MAX_READINGS = 200_000  # of a receiver: hours; what comes later is not gathered
 INTERVALS = 1000  # inertial samples whose spacing is looked at
-LOOK_NS = SECOND // 2  # between two looks at the filter's expectations, in recorded time
+LOOK_NS = 3 * SECOND  # between two looks at the filter's expectations of the last second: a sample is enough
 JUDGED = (Outcome.FUSED, Outcome.REJECTED)
 
 
@@ -81,7 +81,9 @@ class Evidence:
         measurement = receipt.measurement
         self.gathering.add(measurement)
         payload, t_ns = measurement.payload, measurement.t_ns + self.gathering.moved_ns
-        if isinstance(payload, ImuSample):
+        if isinstance(payload, WheelSpeed):  # the most frequent first
+            pass
+        elif isinstance(payload, ImuSample):
             if len(self.spacing) < INTERVALS and self._last_imu_ns is not None:
                 self.spacing.append((t_ns - self._last_imu_ns) / SECOND)
             self._last_imu_ns = t_ns

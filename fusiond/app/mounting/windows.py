@@ -69,13 +69,13 @@ class Gathering:
     def add(self, measurement: Measurement) -> None:
         """Add one event; other kinds are ignored."""
         payload, t_ns = measurement.payload, measurement.t_ns + self.moved_ns
-        if isinstance(payload, ImuSample):
+        if isinstance(payload, WheelSpeed):
+            _put(self.wheels[measurement.source], t_ns, (payload.speed,))
+        elif isinstance(payload, ImuSample):
             self._span_ns = (self._span_ns or (t_ns, 0))[0], t_ns
             _put(self.imu, t_ns, payload.specific_force_b + payload.angular_rate_b)
         elif isinstance(payload, GnssVelocity):
             _put(self.course, t_ns, (payload.north, payload.east))
-        elif isinstance(payload, WheelSpeed):
-            _put(self.wheels[measurement.source], t_ns, (payload.speed,))
 
     @property
     def elapsed_ns(self) -> int:
