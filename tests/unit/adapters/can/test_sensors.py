@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from threading import Event, Thread
+from time import sleep
 
+import can
 import cantools
 import pytest
 
 from fusiond.config import load as config
 from fusiond.config.toml import ConfigError
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Invalid, Received
+from fusiond.ports.inputs import Inbox
 from fusiond.units import MILLISECOND, SECOND
+from fusiond_adapters.can.bus import CanBus
 from fusiond_adapters.can.decoder import CanDecoder
+from fusiond_adapters.host.clock import HostClock
 
 DBC = """VERSION ""
 BU_: ECU
@@ -198,3 +204,32 @@ def test_what_the_dbc_lacks_is_named(tmp_path: Path, sensor: str, complaint: str
     with pytest.raises(ConfigError) as raised:
         Bus(tmp_path, sensor)
     assert complaint in str(raised.value)
+
+
+def test_samples_come_live_from_a_bus(tmp_path: Path) -> None:
+    """A session on python-can's virtual bus: what another sends is decoded as from a log."""
+    (tmp_path / "body.dbc").write_text(DBC)
+    text = f'[can.body]\ndbc = ["body.dbc"]\ninterface = "virtual"\nchannel = "samples"\n{IMU}{GNSS}'
+    live = CanBus(config.parse(text, tmp_path / "c.toml"), "body", Inbox(64, lambda: None, hash), HostClock())
+    live.prepare()
+    stop = Event()
+    with can.Bus(interface="virtual", channel="samples") as sender:
+        thread = Thread(target=live.session, args=(stop,))
+        thread.start()
+        try:
+            found: list[Received] = []
+            for _ in range(200):
+                for name, values in (("ACCEL", {"Z": -9.75}), ("GYRO", {}), ("PLACE", {"LAT": 48.0}), ("HEIGHT", {})):
+                    kind = DATABASE.get_message_by_name(name)
+                    data = kind.encode({signal.name: 0.0 for signal in kind.signals} | values, strict=False)
+                    sender.send(can.Message(arbitration_id=kind.frame_id, is_extended_id=False, data=data))
+                sleep(0.01)
+                found += [event for t_ns, frame in live.inbox.take() for event in live.decode(frame, t_ns)]
+                if {"imu0", "gps0.position"} <= {event.source for event in found}:
+                    break
+        finally:
+            stop.set()
+            thread.join()
+    samples = [event.payload for event in found if isinstance(event.payload, ImuSample)]
+    assert samples and samples[0].specific_force_b == pytest.approx((0.0, 0.0, -9.75))
+    assert any(isinstance(event.payload, GnssPosition) for event in found)
