@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from statistics import median
 
 from fusiond.app.batch.findings import SOME, Findings, Worst
 from fusiond.app.batch.significance import FIGURES, RISK, Comparison, Paired
@@ -50,8 +51,7 @@ def compared(found: Findings) -> str:
 
 def _medians(found: Findings) -> Iterator[tuple[str, str, str, str]]:
     for name, values in found.values.items():
-        middle = sorted(values["new"])[len(values["new"]) // 2]
-        yield f"  {ABOUT[name].about}", number(middle), ABOUT[name].unit, str(len(values["new"]))
+        yield f"  {ABOUT[name].about}", number(median(values["new"])), ABOUT[name].unit, str(len(values["new"]))
 
 
 def _comparison(compared: Comparison, unpaired: int) -> Iterator[str]:
