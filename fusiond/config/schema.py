@@ -37,6 +37,7 @@ GUARD_KEYS = (
     "direction_signal", "forward_values", "valid_signal", "counter_signal", "checksum", "not_available_from", "base_signal",
 )  # fmt: skip
 STAMPS = {"sensor": "by its own stamp", "arrival": "by its arrival"}
+Estimate = Literal["mean", "median", "map"]
 Unit = Literal["m/s", "km/h", "mph", "rad/s", "rpm"]
 SpeedUnit = Literal["m/s", "km/h", "mph", "kn"]
 AccelUnit = Literal["m/s^2", "g", "mg"]
@@ -64,6 +65,7 @@ class Filter(Section, frozen=True, kw_only=True):
     restart_gap_s: Seconds = 30.0  # after a gap of this length in the data the filter aligns again
     gate_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.999  # share of good measurements that pass the innovation gate
     spoof_cost: Positive = 3.0  # what a metre costs by which a lying receiver pulls the state, against the next
+    estimate: Estimate = "mean"  # what is published while rivals contend: mean, median, or map, the likeliest rival
     dead_reckoning_cost: Positive = 1.0  # what a metre costs by which dead reckoning drifts off a receiver that was right
     v_max_mps: Positive = 60.0  # top speed of the vehicle: the initial velocity sigma is a third of it
     heading_deg: Annotated[float, Meta(ge=-360, le=360)] | None = None  # heading at the first start, clockwise from north

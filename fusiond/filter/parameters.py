@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
-from fusiond.config.schema import Config, Filter, Imu, Source, calibrated, wheel_groups
+from fusiond.config.schema import Config, Estimate, Filter, Imu, Source, calibrated, wheel_groups
 from fusiond.config.sensor import INERTIAL, Stream
 from fusiond.filter.measurement_update import correlation_factor
 from fusiond.filter.observations import (
@@ -78,6 +79,7 @@ class Parameters:
     imu_gap_ns: int
     restart_gap_ns: int
     spoof_cost: float  # loss for each metre by which a lying receiver pulls the state
+    estimate: int  # place in Estimate: what is published of a mixture
     dead_reckoning_cost: float  # loss for each metre by which dead reckoning drifts off a receiver that was right
     heading_variance: float  # rad^2: the spread of the headings at which the bank is collapsed
     constraint_interval_ns: int
@@ -128,6 +130,7 @@ def make_parameters(config: Config, stored: StoredState | None = None) -> Parame
         imu_gap_ns=nanoseconds(settings.imu_gap_s),
         restart_gap_ns=nanoseconds(settings.restart_gap_s),
         spoof_cost=settings.spoof_cost,
+        estimate=get_args(Estimate).index(settings.estimate),
         dead_reckoning_cost=settings.dead_reckoning_cost,
         heading_variance=square(math.radians(settings.heading_spread_deg)),
         constraint_interval_ns=nanoseconds(motion.interval_s),

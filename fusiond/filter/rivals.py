@@ -65,6 +65,10 @@ from fusiond.maths.typed import ErrorRows3, Matrix3, Vector, Vector3, compiled
 from fusiond.units import SECOND
 
 RIVALS = 4
+MEAN, MEDIAN = 0, 1  # places in the configuration's Estimate; the third is the likeliest hypothesis
+HALF = 0.5
+LEAST_SIGMA = 1e-12
+HALVINGS = 40  # of the distance between hypotheses, to find a median
 INERTIAL, RECEIVER, RETURN, WHEELS = range(RIVALS)  # places in the bank while the filter runs
 LEAST_ODDS = 1e-6  # of the inertial sensor having lied, while nothing speaks for it
 BEGIN = 0.01  # odds with which a rival begins
@@ -496,29 +500,78 @@ def _exclude(memory: Vector, excluded: float) -> None:
 
 
 @compiled
-def mix(state: FilterState) -> None:
-    """Make the state the mixture's: its mean and covariance, about the main state (B6)."""
-    total = state.auxiliary[MAIN_WEIGHT]
+def below(z: float) -> float:
+    """Probability that a standard normal variable is below z, to 1e-7 (Abramowitz and Stegun 26.2.17)."""
+    t = 1 / (1 + 0.2316419 * abs(z))
+    series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
+    beyond = 0.3989422804014327 * exp(-min(z * z, MAX_SQUARE) / 2) * series
+    return beyond if z < 0 else 1 - beyond
+
+
+@compiled
+def median(weights: Vector, means: Vector, sigmas: Vector) -> float:
+    """Of the mixture of all hypotheses (RIVALS + 1,) along one axis; the weights sum to 1."""
+    low, high = math.inf, -math.inf
+    for i in range(RIVALS + 1):
+        if weights[i] > 0:
+            low, high = min(low, means[i]), max(high, means[i])
+    for _step in range(HALVINGS):
+        middle, share = (low + high) / 2, 0.0
+        for i in range(RIVALS + 1):
+            if weights[i] > 0:
+                share += weights[i] * below((middle - means[i]) / max(sigmas[i], LEAST_SIGMA))
+        if share < HALF:
+            low = middle
+        else:
+            high = middle
+    return (low + high) / 2
+
+
+@compiled
+def mix(  # noqa: PLR0912 - loops
+    state: FilterState, estimate: int
+) -> None:
+    """Make the state the mixture's: its `estimate`, that of least squared error (the mean), of least absolute error (the
+    median of each error state), or the likeliest hypothesis (A7), with the covariance about it (B6)."""
+    weights, errors = np.zeros(RIVALS + 1), np.zeros((RIVALS + 1, state.size))
+    weights[RIVALS] = state.auxiliary[MAIN_WEIGHT]
+    total, most = state.auxiliary[MAIN_WEIGHT], RIVALS
     for slot in range(RIVALS):
         total += state.bank[slot, 0]
-    errors, mean = np.zeros((RIVALS, state.size)), np.zeros(state.size)
+    weights[RIVALS] /= total
     for slot in range(RIVALS):
         if state.bank[slot, 0] > 0:
             rival = state.hypothesis(slot)
+            weights[slot] = state.bank[slot, 0] / total
             errors[slot] = difference(rival, state)
-            mean += state.bank[slot, 0] / total * errors[slot]
+            if weights[slot] > weights[most]:
+                most = slot
+    chosen = np.zeros(state.size)
+    if estimate == MEAN:
+        for slot in range(RIVALS):
+            chosen += weights[slot] * errors[slot]
+    elif estimate == MEDIAN:
+        means, sigmas = np.zeros(RIVALS + 1), np.zeros(RIVALS + 1)
+        for k in range(state.size):
+            sigmas[RIVALS] = math.sqrt(state.covariance[k, k])
+            for slot in range(RIVALS):
+                if weights[slot] > 0:
+                    rival = state.hypothesis(slot)
+                    means[slot], sigmas[slot] = errors[slot, k], math.sqrt(rival.covariance[k, k])
+            chosen[k] = median(weights, means, sigmas)
+    else:
+        chosen[:] = errors[most]
     p = state.covariance
     for j in range(state.size):
-        p[j] *= state.auxiliary[MAIN_WEIGHT] / total
-        p[j] += mean[j] * (state.auxiliary[MAIN_WEIGHT] / total) * mean
+        p[j] *= weights[RIVALS]
+        p[j] += chosen[j] * weights[RIVALS] * chosen
     for slot in range(RIVALS):
-        if state.bank[slot, 0] > 0:
-            weight = state.bank[slot, 0] / total
+        if weights[slot] > 0:
             rival = state.hypothesis(slot)
             for j in range(state.size):
-                p[j] += weight * (rival.covariance[j] + (errors[slot, j] - mean[j]) * (errors[slot] - mean))
+                p[j] += weights[slot] * (rival.covariance[j] + (errors[slot, j] - chosen[j]) * (errors[slot] - chosen))
     mirror(p)
-    inject(state, mean)
+    inject(state, chosen)
 
 
 def probability_of_lie(state: FilterState, source: int, params: Parameters) -> float | None:

@@ -296,7 +296,7 @@ def predict(state: FilterState, t_ns: int, params: Parameters) -> None:
                 stamps[T] = begin
                 rival = state.hypothesis(slot)
                 _predict(rival, t_ns, params)
-        mix(state)
+        mix(state, params.estimate)
 
 
 @compiled

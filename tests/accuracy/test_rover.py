@@ -51,7 +51,8 @@ def test_a_stock_rover(tmp_path: Path, system_time_off_s: float) -> None:
     state is nominal and the heading right, there is no reset, and the delay is learnt."""
     scenario = parse(DRIVE)
     drive, start_ns = simulate(scenario), scenario.start_ns
-    text = configuration(scenario, "wheels.dbc").replace("[imu.imu0]", f"[imu.imu0]\ndelay_ms = {GIVEN_DELAY_MS}\ndelay_sigma_ms = 50.0")
+    imu = f"[imu.imu0]\ndelay_ms = {GIVEN_DELAY_MS}\ndelay_sigma_ms = 50.0"
+    text = configuration(scenario, "wheels.dbc").replace("[imu.imu0]", imu)
     (tmp_path / "wheels.dbc").write_text(dbc(scenario))
     (tmp_path / "rover.toml").write_text(text)
     rover = StockRover(drive, system_time_off_s=system_time_off_s)

@@ -4,10 +4,12 @@ weights, their mixture and the decision between them against the closed forms.""
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from fusiond.config.schema import Estimate
 from fusiond.estimator.fusion import Fusion
 from fusiond.filter import rivals
 from fusiond.filter.measurement_update import difference, inject
@@ -32,7 +34,7 @@ from fusiond.maths.rotation import matrix
 from tests.conftest import needs_compiled
 from tests.helpers.streams import SECOND, T0, Drive, config, measurements, running_state, town
 from tests.oracles.decision import posterior
-from tests.oracles.mixture import Mixture, collapse
+from tests.oracles.mixture import Loss, Mixture, collapse, estimate
 
 RUNS, SECONDS = 10, 60.0
 BLOCKS = {"position": POSITION, "velocity": VELOCITY, "attitude": ATTITUDE}
@@ -138,10 +140,34 @@ def test_what_is_published_has_the_moments_of_the_rivals() -> None:
         errors.append(error)
         spreads.append(rival.covariance.copy())
     before = state.copy()
-    rivals.mix(state)
+    rivals.mix(state, rivals.MEAN)
     expected = collapse(Mixture(np.array([1.0, *odds.values()]) / 2, np.array(errors), np.array(spreads)))
     np.testing.assert_allclose(difference(state, before), expected.mean, atol=1e-8)
     np.testing.assert_allclose(state.covariance, expected.covariance, rtol=1e-6, atol=1e-11)
+
+
+@pytest.mark.parametrize(("chosen", "loss"), [("mean", "squared"), ("median", "absolute"), ("map", "zero-one")])
+def test_what_is_published_has_the_least_loss(chosen: Estimate, loss: Loss) -> None:
+    """A7: of the main state and a rival 4 m above it, of two thirds of the weight, against the losses of their mixture along
+    each axis; and the covariance about that."""
+    state, _, _ = contested({rivals.RECEIVER: 2.0})
+    error = np.zeros(state.size)
+    error[POSITION] = (1.0, -2.0, 3.0)
+    state.covariance[:] = 0.25 * np.eye(state.size)
+    rival = state.hypothesis(rivals.RECEIVER)
+    rival.covariance[:] = 0.25 * np.eye(state.size)
+    inject(rival, error)
+    before = state.copy()
+    rivals.mix(state, get_args(Estimate).index(chosen))
+    found, weights = difference(state, before), np.array([1.0, 2.0]) / 3
+    for k in range(POSITION.start, POSITION.stop):
+        along = Mixture(weights, np.array([[0.0], [error[k]]]), np.full((2, 1, 1), 0.25))
+        if loss != "zero-one" or abs(error[k]) >= 3.0:  # nearer peaks overlap: the likeliest hypothesis is not the mode
+            assert found[k] == pytest.approx(estimate(along, loss)[0], abs=1e-3)
+    np.testing.assert_allclose(
+        state.covariance, 0.25 * np.eye(state.size) + weights[0] * np.outer(found, found)
+        + weights[1] * np.outer(error - found, error - found), atol=1e-6
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("spoof", "reckoning"), [(3.0, 1.0), (1.0, 1.0), (1.0, 4.0)])

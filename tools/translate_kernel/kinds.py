@@ -151,6 +151,7 @@ FIELDS: dict[str, dict[str, Kind]] = {  # of the structs
         "zero_velocity_factor": FLOAT,
         "heading_variance": FLOAT,
         "spoof_cost": FLOAT,
+        "estimate": INT,
         "dead_reckoning_cost": FLOAT,
     },
 }

@@ -3372,49 +3372,116 @@ cdef void rivals__exclude(double* memory, double excluded) noexcept nogil:
     if (excluded != 0):
         source_health_distrust(memory)
 
-cdef void rivals_mix(State* state) noexcept nogil:
+cdef double rivals_below(double z) noexcept nogil:
+    cdef double t
+    cdef double series
+    cdef double _t1
+    cdef double beyond
+    t = (1 / (1 + (0.2316419 * fabs(z))))
+    series = (t * (0.31938153 + (t * ((-0.356563782) + (t * (1.781477937 + (t * ((-1.821255978) + (t * 1.330274429)))))))))
+    _t1 = (z * z)
+    beyond = ((0.3989422804014327 * portable_exp(((-(1000.0 if 1000.0 < _t1 else _t1)) / 2))) * series)
+    return (beyond if (z < 0) else (1 - beyond))
+
+cdef double rivals_median(double* weights, double* means, double* sigmas) noexcept nogil:
+    cdef double low
+    cdef double high
+    cdef int64_t i
+    cdef double _t1
+    cdef double _t2
+    cdef int64_t _step
+    cdef double middle
+    cdef double share
+    cdef double _t3
+    cdef double _t4
+    low, high = INFINITY, (-INFINITY)
+    for i in range((4 + 1)):
+        if (weights[i] > 0):
+            _t1 = means[i]
+            _t2 = means[i]
+            low, high = (_t1 if _t1 < low else low), (_t2 if _t2 > high else high)
+    for _step in range(40):
+        middle, share = ((low + high) / 2), 0.0
+        for i in range((4 + 1)):
+            if (weights[i] > 0):
+                _t3 = sigmas[i]
+                _t4 = 1e-12
+                share += (weights[i] * rivals_below(((middle - means[i]) / (_t4 if _t4 > _t3 else _t3))))
+        if (share < 0.5):
+            low = middle
+        else:
+            high = middle
+    return ((low + high) / 2)
+
+cdef void rivals_mix(State* state, int64_t estimate) noexcept nogil:
+    cdef double weights[(4 + 1)]
+    cdef double errors[(4 + 1) * n]
     cdef double total
+    cdef int64_t most
     cdef int64_t slot
-    cdef double errors[4 * n]
-    cdef double mean[n]
     cdef State rival
     cdef double _t1[n]
     cdef int _i
+    cdef double chosen[n]
+    cdef double means[(4 + 1)]
+    cdef double sigmas[(4 + 1)]
+    cdef int64_t k
     cdef double* p
     cdef int64_t j
     cdef double _t2
-    cdef double weight
     cdef double _t3
     cdef double _t4
-    total = state.auxiliary[40]
+    cdef double _t5
+    memset(weights, 0, (4 + 1) * sizeof(double))
+    memset(errors, 0, (4 + 1) * n * sizeof(double))
+    weights[4] = state.auxiliary[40]
+    total, most = state.auxiliary[40], 4
     for slot in range(4):
         total += state.bank[(slot) * BLOCK + 0]
-    memset(errors, 0, 4 * n * sizeof(double))
-    memset(mean, 0, n * sizeof(double))
+    weights[4] /= total
     for slot in range(4):
         if (state.bank[(slot) * BLOCK + 0] > 0):
             rival = hypothesis_of(state, slot)
+            weights[slot] = (state.bank[(slot) * BLOCK + 0] / total)
             measurement_update_difference(&rival, state, _t1)
             for _i in range(n):
                 (errors + (slot) * n)[_i] = _t1[_i]
-            axpy(mean, (state.bank[(slot) * BLOCK + 0] / total), errors + (slot) * n)
+            if (weights[slot] > weights[most]):
+                most = slot
+    memset(chosen, 0, n * sizeof(double))
+    if (estimate == 0):
+        for slot in range(4):
+            axpy(chosen, weights[slot], errors + (slot) * n)
+    elif (estimate == 1):
+        memset(means, 0, (4 + 1) * sizeof(double))
+        memset(sigmas, 0, (4 + 1) * sizeof(double))
+        for k in range(n):
+            sigmas[4] = sqrt(state.covariance[(k) * n + k])
+            for slot in range(4):
+                if (weights[slot] > 0):
+                    rival = hypothesis_of(state, slot)
+                    means[slot], sigmas[slot] = errors[(slot) * n + k], sqrt(rival.covariance[(k) * n + k])
+            chosen[k] = rivals_median(weights, means, sigmas)
+    else:
+        for _i in range(n):
+            chosen[_i] = (errors + (most) * n)[_i]
     p = state.covariance
     for j in range(n):
-        _t2 = (state.auxiliary[40] / total)
+        _t2 = weights[4]
         for _i in range(n):
             (p + (j) * n)[_i] *= _t2
-        axpy(p + (j) * n, (mean[j] * (state.auxiliary[40] / total)), mean)
+        axpy(p + (j) * n, (chosen[j] * weights[4]), chosen)
     for slot in range(4):
-        if (state.bank[(slot) * BLOCK + 0] > 0):
-            weight = (state.bank[(slot) * BLOCK + 0] / total)
+        if (weights[slot] > 0):
             rival = hypothesis_of(state, slot)
             for j in range(n):
-                _t3 = (errors[(slot) * n + j] - mean[j])
-                _t4 = (errors[(slot) * n + j] - mean[j])
+                _t3 = (errors[(slot) * n + j] - chosen[j])
+                _t4 = (errors[(slot) * n + j] - chosen[j])
+                _t5 = weights[slot]
                 for _i in range(n):
-                    (p + (j) * n)[_i] += (weight * ((rival.covariance + (j) * n)[_i] + (_t4 * ((errors + (slot) * n)[_i] - mean[_i]))))
+                    (p + (j) * n)[_i] += (_t5 * ((rival.covariance + (j) * n)[_i] + (_t4 * ((errors + (slot) * n)[_i] - chosen[_i]))))
     linear_mirror(p)
-    measurement_update_inject(state, mean)
+    measurement_update_inject(state, chosen)
 
 # ---------------- fusiond.filter.smoothing
 
@@ -4397,7 +4464,7 @@ cdef void step_predict(State* state, int64_t t_ns, Parameters* params) noexcept 
                 stamps[0] = begin
                 rival = hypothesis_of(state, slot)
                 step__predict(&rival, t_ns, params)
-        rivals_mix(state)
+        rivals_mix(state, params.estimate)
 
 cdef void step__predict(State* state, int64_t t_ns, Parameters* params) noexcept nogil:
     cdef int64_t* stamps

@@ -99,6 +99,7 @@ cdef struct Parameters:
     double zero_velocity_factor
     double heading_variance
     double spoof_cost
+    int64_t estimate
     double dead_reckoning_cost
 
 
@@ -119,5 +120,6 @@ cdef int load_scalars(Parameters* loaded, params) except -1:
     loaded.zero_velocity_factor = params.zero_velocity_factor
     loaded.heading_variance = params.heading_variance
     loaded.spoof_cost = params.spoof_cost
+    loaded.estimate = params.estimate
     loaded.dead_reckoning_cost = params.dead_reckoning_cost
     return 0

@@ -104,7 +104,7 @@ def test_mixing_keeps_the_moments() -> None:
     means = np.array([np.zeros(state.size), *(difference(rival, before) for rival in alive)])
     covariances = np.array([before.covariance, *(rival.covariance for rival in alive)])
     expected = collapse(Mixture(weights / weights.sum(), means, covariances))
-    rivals.mix(state)
+    rivals.mix(state, rivals.MEAN)
     np.testing.assert_allclose(state.covariance, expected.covariance, rtol=1e-9, atol=1e-15)
     np.testing.assert_array_equal(state.covariance, state.covariance.T)
     np.testing.assert_allclose(difference(state, before), expected.mean, rtol=1e-6, atol=2e-9)  # of 6,400 km
