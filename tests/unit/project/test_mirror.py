@@ -23,6 +23,7 @@ SCENARIOS = {  # tests of several modules together, and which
     "adapters/zenoh/test_yard.py": "the sample configuration of a router for many vehicles",
     "app/commands/test_command_line.py": "all commands, by their command lines",
     "app/commands/test_commands.py": "what every command has in common",
+    "app/commands/test_inspecting.py": "the commands that look at logs and begin a configuration",
     "app/live/test_hostile.py": "the daemon among hostile processes: UDP, signing, network namespace",
     "filter/observations/test_observations.py": "every observation model of the table",
     "filter/test_closed_forms.py": "decisions of the filter against the closed forms of tests/oracles",
