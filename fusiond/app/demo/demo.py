@@ -67,7 +67,7 @@ def run(out: Path, speed: float, *, publish: bool = False) -> None:
             Options(
                 config=settings,
                 config_name="fusiond.toml",
-                logs=[str(path) for path in sorted(Path(folder).iterdir())],
+                logs=[str(path) for path in sorted(Path(folder).glob("*log"))],
                 csv=out / "track.csv",
                 json=out / "summary.json",
                 truth=DRIVE / "truth.csv.gz",

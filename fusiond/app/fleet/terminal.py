@@ -22,6 +22,7 @@ from fusiond.config.outputs import SITES
 from fusiond.errors import OutputError
 from fusiond.messages.types import HealthMessage, StateMessage
 
+UNFOLDED = 10_000  # columns
 GATHER_S = 2.5  # how long `once` listens: a health message comes each second
 LOOK_S = 0.5  # between two looks for alarms and for the map
 
@@ -48,9 +49,9 @@ def listening(client: Client) -> Iterator[Fleet]:
 
 
 def once(fleet: Fleet, out: TextIO) -> None:
-    """Listen for a moment, and print everything as text."""
+    """Listen for a moment, and print everything as text: into a pipe or a file each vehicle as one line."""
     time.sleep(GATHER_S)
-    width, _ = shutil.get_terminal_size((200, 100))
+    width = shutil.get_terminal_size().columns if out.isatty() else UNFOLDED
     for line in screen(fleet.look(), width):
         out.write(plain(line) + "\n")
 

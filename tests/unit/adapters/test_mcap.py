@@ -216,8 +216,9 @@ def test_the_configuration_is_in_the_file(replayed: tuple[Read, list[str], Path]
 def test_a_file_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs = [str(folder() / log) for log in LOGS]
     command = ["replay", "--config", str(folder() / "fusiond.toml"), *logs, "--mcap"]
-    assert main([*command, str(tmp_path)]) == UNUSABLE
-    assert f"{tmp_path}: cannot be written" in capsys.readouterr().err
+    (tmp_path / "folder.mcap").mkdir()
+    assert main([*command, str(tmp_path / "folder.mcap")]) == UNUSABLE
+    assert "folder.mcap: cannot be written" in capsys.readouterr().err
     assert main([*command, logs[0]]) == USAGE
     with limited_files(50_000):
         assert main([*command, str(tmp_path / "a.mcap")]) == UNUSABLE

@@ -54,12 +54,12 @@ def test_a_configuration_gets_the_outputs_that_it_turns_on(tmp_path: Path) -> No
 
 
 def test_an_unknown_log_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    (tmp_path / "a.db.gz").write_bytes(b"x")
+    (tmp_path / "a.odd").write_bytes(b"x")
     with pytest.raises(LogError) as refused:
-        open_logs([tmp_path / "a.db.gz"], config.parse('[mavlink.fc]\n[imu.imu0]\nlink = "fc"\n[gnss.g]\nlink = "fc"\n'))
+        open_logs([tmp_path / "a.odd"], config.parse('[mavlink.fc]\n[imu.imu0]\nlink = "fc"\n[gnss.g]\nlink = "fc"\n'))
     text = str(refused.value)
     assert all(f"{kind.suffix} ({kind.about})" in text for kind in LOG_FORMATS)
-    assert text.endswith("all but .db and .mf4 also with .gz")
+    assert text.endswith("all also with .gz or .zst")
 
 
 def test_nothing_is_imported_for_what_is_off() -> None:

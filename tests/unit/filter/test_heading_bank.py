@@ -13,7 +13,7 @@ from fusiond.estimator.fusion import Fusion
 from fusiond.estimator.solution import Mode
 from fusiond.events import GnssPosition, GnssVelocity, ImuSample, Measurement, WheelSpeed
 from fusiond.filter.heading_bank import collapse_if_close, fuse_measurement, normalise, weigh
-from fusiond.filter.observations.model import Observation
+from fusiond.filter.observations.model import VALUES, Observation
 from fusiond.filter.parameters import make_parameters
 from fusiond.filter.state import BLOWN, CHOOSING, HYPOTHESES, PHASE, RESETS, RUNNING, VELOCITY, FilterState, T
 from fusiond.maths.wgs84 import geodetic, mat_ne
@@ -129,7 +129,7 @@ def test_wheels_wait_for_the_velocity(compiled: bool) -> None:
     head, params = fusion.history.head, fusion.params
     assert head.stamps[PHASE] == CHOOSING
     source = params.sources.index("rear_left")
-    values, parameter = np.array([4.0, 0.05**2, 0.0]), params.model_parameters[source]
+    values, parameter = np.array([4.0, 0.05**2, *[0.0] * (VALUES - 2)]), params.model_parameters[source]
     before = head.bank.copy()
     fuse_measurement(head, 0, params.models[source], values, parameter, 1.0, params)
     np.testing.assert_array_equal(head.bank, before)
