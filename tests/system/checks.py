@@ -148,7 +148,7 @@ def replayed_identically(file: Path, box: Path, payloads: list[bytes]) -> str:
     def keep(message: StateMessage, _: object) -> None:
         again[message.t_ns] = encode(message, "json")
 
-    logs = [str(path) for path in sorted(box.iterdir())]
+    logs = [str(path) for path in sorted(box.glob("*log"))]
     Replay(settings, ReplayTask(settings.publish.rate_hz, on_tick=[keep])).run(open_logs(logs, settings))
     live = {int(json.loads(payload)["t_ns"]): payload for payload in payloads}
     both = again.keys() & live.keys()
