@@ -17,7 +17,7 @@ from fusiond.app.batch import keys
 from fusiond.app.batch.drives import find
 from fusiond.app.batch.engines import Engine
 from fusiond.app.batch.findings import Findings, Keyed, gather
-from fusiond.app.batch.job import Answer, Job, Limits, Options
+from fusiond.app.batch.job import OWN, Answer, Job, Limits, Options
 from fusiond.app.batch.page import page
 from fusiond.app.batch.row import Row
 from fusiond.app.batch.store import Cost, Store
@@ -39,7 +39,6 @@ from fusiond.errors import UnusableError, UsageError
 
 NEW, BASELINE, TUNED = "new", "baseline", "tuned"  # roles
 VEHICLES = "vehicles.parquet"  # what is each vehicle's own
-OWN = "own"  # in place of a configuration: the one that lies beside each drive
 DRAWN_S = 0.2  # between two drawings of the progress
 ROWS, SUMMARY, TRACKS, REPORTS = "rows.parquet", "summary.html", "tracks", "reports"
 

@@ -11,6 +11,8 @@ from fusiond import __version__
 from fusiond.app.batch.row import Row, Status
 from fusiond.app.tuning.tune import Finding
 
+OWN = "own"  # in place of a configuration: the one that lies beside each drive
+
 
 class DriveFile(Struct, frozen=True, kw_only=True):
     """A file of a drive: a path or an URL, the name that it is read under, and the link or bus of a log if it is given."""

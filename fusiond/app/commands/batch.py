@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fusiond.app.batch import batch
-from fusiond.app.batch.batch import OWN, ROWS, SUMMARY, Order
 from fusiond.app.batch.engines import Cluster, Engine, LocalPool, cores
 from fusiond.app.batch.findings import WORST
-from fusiond.app.batch.job import Limits, Options
+from fusiond.app.batch.job import OWN, Limits, Options
 from fusiond.app.batch.summary import compared, text
 from fusiond.app.batch.tune import lines
 from fusiond.app.commands import EXIT_CODES
@@ -17,6 +16,9 @@ from fusiond.app.commands.argument_types import count, positive, rate, seed
 from fusiond.app.replay.files import check_outputs, delivering
 from fusiond.app.replay.outages import parse_length
 from fusiond.errors import UsageError
+
+if TYPE_CHECKING:
+    from fusiond.app.batch.batch import Order
 
 WORSE = 3  # exit code
 
@@ -65,11 +67,13 @@ def fill(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from fusiond.app.batch import batch  # noqa: PLC0415 - needs the extra `batch`
+
     if arguments.outage:
         parse_length(arguments.outage)
     options = Options(rate_hz=arguments.rate, outage=arguments.outage, smooth=arguments.smooth, tracks=arguments.tracks)
     limits = Limits(seconds=arguments.seconds, memory_mb=arguments.memory)
-    order = Order(
+    order = batch.Order(
         arguments.drives, arguments.out, arguments.config, arguments.baseline, options, limits, reports=arguments.reports
     )
     batch.check(order)
@@ -84,13 +88,15 @@ def run(arguments: argparse.Namespace) -> int:
     cost = result.cost
     print(
         f"\n{result.made} of {cost.rows} rows were made now; all cost {cost.cpu_s:.0f} s of processor time,"
-        f" the largest {cost.peak_mb:.0f} MB\n{order.folder / ROWS}\n{order.folder / SUMMARY}"
+        f" the largest {cost.peak_mb:.0f} MB\n{order.folder / batch.ROWS}\n{order.folder / batch.SUMMARY}"
     )
     return WORSE if result.findings.comparison is not None and result.findings.comparison.is_worse else 0
 
 
 def _tune(order: Order, arguments: argparse.Namespace) -> int:
     """Tune one configuration by all drives."""
+    from fusiond.app.batch import batch  # noqa: PLC0415 - needs the extra `batch`
+
     if order.config == OWN or order.baseline is not None:
         raise UsageError("--tune needs one configuration by --config, and no baseline: it is compared with itself")
     check_outputs([arguments.tune], [Path(order.config)])

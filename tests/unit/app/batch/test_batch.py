@@ -20,9 +20,9 @@ import polars as pl
 import pytest
 
 from fusiond.__main__ import main
-from fusiond.app.batch.batch import OWN, ROWS, SUMMARY, Order, Result, run
+from fusiond.app.batch.batch import ROWS, SUMMARY, Order, Result, run
 from fusiond.app.batch.engines import Cluster, Engine, LocalPool, Numbered
-from fusiond.app.batch.job import Answer, Limits, Options
+from fusiond.app.batch.job import OWN, Answer, Limits, Options
 from fusiond.app.batch.row import Row
 from fusiond.app.batch.table import read_rows
 from fusiond.config import load, recorded

@@ -25,6 +25,17 @@ def test_each_has_arguments_and_an_action(name: str) -> None:
     assert module.__doc__ and module.__doc__.startswith(f"fusiond {name}: ")
 
 
+def test_each_explains_itself_without_any_extra() -> None:
+    """The man page is made where only the core is installed."""
+    extras = ("fsspec", "pyarrow", "distributed", "bokeh", "matplotlib", "pandas", "rosbags", "mcap", "foxglove", "xxhash",
+              "prometheus_client", "pyulog", "asammdf", "zstandard")  # fmt: skip
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({extras})); import fusiond.__main__ as m\n"
+        f"for name in {tuple(COMMANDS)}: m.parser(name).format_help()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_the_daemon_imports_no_other_command() -> None:
     """Its grammar imports next to nothing; all of the daemon no module of another command."""
     code = (
